@@ -232,7 +232,6 @@ def real_capture(ict_folder: Path, performances: list[Path]) -> tuple[Blendshape
     weights = []
     for path in performances:
         track = load_take(path).weights
-        assert track is not None
         weights.append((track.values[..., 0] @ mapping(track.names, rig.names).T).clamp(0, 1))
     return rig, place_markers(rig, 100), weights
 

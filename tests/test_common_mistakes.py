@@ -49,7 +49,7 @@ class Given:
         self.sites = Attachment.from_vertices(self.mesh, range(0, 600, 9))
         self.solver = MarkerSolver(rig, self.sites)
         self.markers = self.sites.on(self.f, rig(torch.zeros(3, len(rig.names))))
-        self.take = Take(30.0, markers=Track(self.sites.labels, self.markers))  # type: ignore[arg-type]
+        self.take = Take(30.0, markers=Track(self.sites.labels, self.markers))
         self.heads = self.v + torch.randn(4, *self.v.shape, generator=torch.Generator().manual_seed(0))
         self.model = MorphableModel.fit(self.heads)
         self.regression = ExpressionRegression.fit(self.heads, self.heads[:, None] + self.d[:1], names=["jawOpen"])
@@ -76,7 +76,7 @@ MISTAKES: dict[str, tuple[Callable[[Given], Any], str]] = {
     "too many weights": (lambda g: g.rig(torch.zeros(2, 9)), r"weights: found \(2, 9\), expected \(B,4\)"),
     "correctives for names": (lambda g: BlendshapeRig(g.mesh, g.d, g.rig.names, g.d), "correctives: found a tensor"),
     "definitions first": (
-        lambda g: Correctives((Corrective("c", g.rig.names[:2]),), g.d[:1]),  # type: ignore[arg-type]
+        lambda g: Correctives((Corrective("c", g.rig.names[:2]),), g.d[:1]),
         "correctives: deltas: found a tuple of Corrective, expected a tensor",
     ),
     "one definition": (lambda g: Correctives(g.d[:1], Corrective("c", g.rig.names[:2])), "expected a list of Corr"),
@@ -181,31 +181,31 @@ def test_landmarks_of_one_frame_are_not_taken_for_68_frames(given: Given) -> Non
 
 def test_arrays_and_lists_give_what_tensors_give(given: Given) -> None:
     g = given
-    mesh = Mesh(g.v.double().numpy(), g.f.int().numpy())  # type: ignore[arg-type]
+    mesh = Mesh(g.v.double().numpy(), g.f.int().numpy())
     assert mesh.fingerprint() == g.mesh.fingerprint()
     assert mesh.vertices.dtype == torch.float32
-    rig = BlendshapeRig(mesh, list(g.d), list(g.rig.names))  # type: ignore[arg-type]
-    assert torch.equal(rig([[0.5, 0, 0, 1]]), g.rig(torch.tensor([[0.5, 0, 0, 1]])))  # type: ignore[arg-type]
-    sites = Attachment(g.sites.triangles.numpy(), g.sites.barycentric.double().numpy())  # type: ignore[arg-type]
+    rig = BlendshapeRig(mesh, list(g.d), list(g.rig.names))
+    assert torch.equal(rig([[0.5, 0, 0, 1]]), g.rig(torch.tensor([[0.5, 0, 0, 1]])))
+    sites = Attachment(g.sites.triangles.numpy(), g.sites.barycentric.double().numpy())
     assert torch.equal(sites.on(g.f, g.v), g.sites.on(g.f, g.v))
-    assert torch.equal(Track(("a",), np.ones((2, 1, 3))).values, torch.ones(2, 1, 3))  # type: ignore[arg-type]
+    assert torch.equal(Track(("a",), np.ones((2, 1, 3))).values, torch.ones(2, 1, 3))
     solved = g.solver(g.markers)
-    assert torch.equal(mesh.with_vertices(g.heads[0].numpy()).vertices, g.heads[0])  # type: ignore[arg-type]
+    assert torch.equal(mesh.with_vertices(g.heads[0].numpy()).vertices, g.heads[0])
     for other in (g.markers.numpy(), g.markers.tolist()):
         torch.testing.assert_close(g.solver(other), solved, rtol=0, atol=1e-6)
     expected = box_qp(g.H, g.q)
     H, q = g.H.numpy(), g.q.numpy()
-    assert torch.equal(box_qp(g.H, g.q, [0, 0, 0], np.ones(3), start=q), expected)  # type: ignore[arg-type]
-    for found in (box_qp(H, q), BoxQP(H)(q), ProjectedGradient(H)(q)):  # type: ignore[arg-type]
+    assert torch.equal(box_qp(g.H, g.q, [0, 0, 0], np.ones(3), start=q), expected)
+    for found in (box_qp(H, q), BoxQP(H)(q), ProjectedGradient(H)(q)):
         assert found.dtype == torch.float64
         torch.testing.assert_close(found, expected, rtol=0, atol=1e-6)
-    assert simplex_qp(H.tolist(), q.tolist()).dtype == torch.float32  # type: ignore[arg-type]
-    model = MorphableModel.fit(g.heads.numpy())  # type: ignore[arg-type]
-    torch.testing.assert_close(model(np.ones((1, 3))), g.model(torch.ones(1, 3)))  # type: ignore[arg-type]
-    torch.testing.assert_close(g.regression(g.v[None].numpy()), g.regression(g.v[None]))  # type: ignore[arg-type]
+    assert simplex_qp(H.tolist(), q.tolist()).dtype == torch.float32
+    model = MorphableModel.fit(g.heads.numpy())
+    torch.testing.assert_close(model(np.ones((1, 3))), g.model(torch.ones(1, 3)))
+    torch.testing.assert_close(g.regression(g.v[None].numpy()), g.regression(g.v[None]))
 
 
 def test_a_type_error_is_one_of_pythons_too(given: Given) -> None:
     with pytest.raises(TypeError):
-        MarkerSolver(given.mesh, given.sites)  # type: ignore[arg-type]
+        MarkerSolver(given.mesh, given.sites)
     assert issubclass(ArgumentTypeError, TorchfaceError)

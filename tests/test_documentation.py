@@ -23,8 +23,6 @@ _BENCH = re.compile(r"\b(test_\w+\.py)\b")
 @pytest.fixture(scope="module")
 def quote_figures() -> ModuleType:
     spec = importlib.util.spec_from_file_location("quote_figures", DOCS / "quote_figures.py")
-    assert spec is not None
-    assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

@@ -12,7 +12,7 @@ from torchface.number_checks import checked_count, checked_number
 
 @pytest.mark.parametrize("value", [0, 2.5, np.float32(2.5), np.int64(3), torch.tensor(2.5), torch.tensor([4])])
 def test_numbers_of_every_kind_come_back(value: object) -> None:
-    assert checked_number("x", value) == float(value)  # type: ignore[arg-type]
+    assert checked_number("x", value) == float(value)
 
 
 @pytest.mark.parametrize(

@@ -85,7 +85,7 @@ def test_arrays_and_lists_do_as_tensors_do(dome_rig: BlendshapeRig) -> None:
     given = dome_rig.neutral
     rig = BlendshapeRig.from_tensors(
         given.vertices.numpy(), given.faces.numpy(), dome_rig.deltas.numpy(), dome_rig.names
-    )  # type: ignore[arg-type]
+    )
     weights = [[0.5] * len(rig.names)]
     expected = dome_rig(torch.tensor(weights))
     for kind in (weights, np.array(weights), torch.tensor(weights, dtype=torch.float64)):

@@ -27,12 +27,12 @@ STAGE = Stage(Level.GRAPH, 1.0, 1.0, 10.0)
 
 
 def fields(made: Callable[..., Any], *names: str) -> dict[str, Setting]:
-    return {f"{made.__qualname__}.{name}": lambda value, name=name: made(**{name: value}) for name in names}  # type: ignore[misc]
+    return {f"{made.__qualname__}.{name}": lambda value, name=name: made(**{name: value}) for name in names}
 
 
 def changed(whole: Any, *names: str) -> dict[str, Setting]:
     kind = type(whole).__name__
-    return {f"{kind}.{name}": lambda value, name=name: replace(whole, **{name: value}) for name in names}  # type: ignore[misc]
+    return {f"{kind}.{name}": lambda value, name=name: replace(whole, **{name: value}) for name in names}
 
 
 SETTINGS: dict[str, Setting] = {
@@ -71,7 +71,7 @@ def test_weights_of_marker_solvers_are_checked(dome_rig: BlendshapeRig, value: f
     solver = MarkerSolver(dome_rig, sites)
     for name in ("sparsity", "ridge"):
         with pytest.raises(ValueRangeError, match=f"{name}: found"):
-            MarkerSolver(dome_rig, sites, **{name: value})  # type: ignore[arg-type]
+            MarkerSolver(dome_rig, sites, **{name: value})
     for name in ("smoothness", "huber_threshold", "sparsity"):
         with pytest.raises(ValueRangeError, match=f"{name}: found"):
             WholeTakeSolver(solver, **{name: value})

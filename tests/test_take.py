@@ -13,8 +13,6 @@ def test_selecting_channels_follows_names_not_order() -> None:
     track = Track(("a", "b", "c"), torch.arange(12.0).reshape(2, 3, 2), torch.arange(6.0).reshape(2, 3) / 6)
     picked = track.select(["c", "a"])
     assert torch.equal(picked.values, track.values[:, [2, 0]])
-    assert picked.confidence is not None
-    assert track.confidence is not None
     assert torch.equal(picked.confidence, track.confidence[:, [2, 0]])
     assert torch.equal(picked.frames(slice(1, 2)).values, track.values[1:, [2, 0]])
 
@@ -41,7 +39,7 @@ def test_a_rate_that_no_camera_has_is_refused(fps: float) -> None:
 def test_a_track_of_another_kind_is_refused(name: str, width: int) -> None:
     for wrong in {0, 1, 2, 3, 4} - {width}:
         with pytest.raises(ShapeError, match=rf"take: found {name} \(4, 1, {wrong}\), expected \(T,C,{width}\)"):
-            Take(60.0, **{name: Track(("a",), torch.zeros(4, 1, wrong))})  # type: ignore[arg-type]
+            Take(60.0, **{name: Track(("a",), torch.zeros(4, 1, wrong))})
 
 
 def test_length_is_the_number_of_frames() -> None:

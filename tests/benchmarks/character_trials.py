@@ -75,7 +75,7 @@ def own_shapes(path: Path) -> tuple[Character, dict[str, Tensor]]:
         for name, rows in zip(block.names, character.targets(block).double(), strict=True):
             moved[name][block.rows] = torch.einsum("vij,vj->vi", character.linear[block.rows], rows)
     found = recognised_shapes(names)
-    return character, {arkit: sum(moved[name] for name in shape.names) for arkit, shape in found.items()}  # type: ignore[misc]
+    return character, {arkit: sum(moved[name] for name in shape.names) for arkit, shape in found.items()}
 
 
 def rigged(one: Trial, folder: Path) -> tuple[CharacterReport, Scores, Scores]:

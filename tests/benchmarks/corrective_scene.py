@@ -78,6 +78,5 @@ def _weights(rig: BlendshapeRig, frames: int, generator: torch.Generator) -> Ten
     weights = torch.zeros(frames, SHAPES)
     for i, name in enumerate(rig.names):
         take = takes[1 if "Local" in name else 0]
-        assert take is not None
         weights[:, i] = take.values[:, take.names.index(name.split("Local")[0]), 0]
     return weights

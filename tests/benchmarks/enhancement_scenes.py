@@ -93,7 +93,6 @@ def take_weights(rig: BlendshapeRig, data: Path) -> list[Tensor]:
     looks = torch.tensor(["look" in name.lower() for name in rig.names])
     for path in sorted((data / "performances").glob("*.csv")):
         track = load_take(path).weights
-        assert track is not None
         weights = (track.values[::2, :, 0] @ mapping(track.names, rig.names).T).clamp(0, 1)
         found.append(weights.masked_fill(looks, 0.0))
     return found

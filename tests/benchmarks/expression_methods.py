@@ -93,10 +93,9 @@ def track(rig: Callable[[Film | Clip], BlendshapeRig] | None, **options: object)
             path = None if rig is None else Path(folder) / "rig.glb"
             if rig is not None and path is not None:
                 save_rig(rig(film), path)
-            settings = TrackSettings(overlay="none", **options)  # type: ignore[arg-type]
+            settings = TrackSettings(overlay="none", **options)
             tracked = track_video(film.path, path, Path(folder) / "out", settings)
             weights = load_take(Path(folder) / "out" / "live_link.csv").weights
-            assert weights is not None
             return weights.values[..., 0].float() @ mapping(weights.names, ARKIT).T, tracked.reading.landmarks
 
     return run
@@ -123,7 +122,6 @@ def person_rig(person: Person, ict: Path) -> BlendshapeRig:
     if len(person.head.rest) != len(own.vertices):
         own = load_ict_facekit(ict)
     notes = own.neutral.annotations
-    assert notes is not None
     rig = BlendshapeRig(own.neutral.with_vertices(person.head.rest), person.head.deltas, own.names)
     return rig.part(notes.regions["face"]) if "face" in notes.regions and len(rig.vertices) > 20_000 else rig
 

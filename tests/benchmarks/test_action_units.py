@@ -78,7 +78,7 @@ def first(films: list[Film]) -> RegionVideo:
 def test_cross_validated_accuracy(films: list[Film], first: RegionVideo) -> None:
     print("\ncross-validated accuracy of unit and level, five parts, one performer")
     for split in ("frames", "repetitions"):
-        found = cross_validation([first], [films[0].labels], split=split)  # type: ignore[arg-type]
+        found = cross_validation([first], [films[0].labels], split=split)
         mean = sum(found.values()) / len(found)
         print(
             f"| {split} | " + " | ".join(f"{k} {100 * v:.1f} %" for k, v in found.items()) + f" | {100 * mean:.1f} % |"
@@ -161,7 +161,7 @@ def test_features_and_machines(films: list[Film], first: RegionVideo) -> None:
                 part = GroupClassifier(group, first.patterns.shape[-1], 1, 2)
                 extract = {"gabor": part.magnitudes, "hog": hog, "edges": edges}[feature]
 
-                def described(video: RegionVideo, step: int, extract=extract, rows=rows) -> np.ndarray:  # type: ignore[no-untyped-def]
+                def described(video: RegionVideo, step: int, extract=extract, rows=rows) -> np.ndarray:
                     frames = video.patterns[::step, rows]
                     found = torch.cat([extract(chunk) for chunk in frames.split(256)])
                     return (found - extract(video.rest[rows][None])).numpy()

@@ -107,7 +107,6 @@ def frames(real_capture: Capture) -> Frames:
     rig, attachment, _ = real_capture
     solver, markers = MarkerSolver(rig, attachment), noisy_markers(real_capture)
     energy = solver.energy(markers)
-    assert energy.constant is not None
     reference, _ = one_by_one(along(daqp_solver(energy.H.numpy()), energy.f), len(energy.f))
     # The better of two exact solves a frame.
     found = (_objective(energy.H, energy.f, x) for x in (reference, box_qp(energy.H, energy.f)))
@@ -305,7 +304,7 @@ def test_an_h_a_frame_when_markers_are_missing(
         if installed(name.lower()):
             solve = make(H.shape[-1])
             solved[f"{name}, one by one"] = one_by_one(
-                lambda row, solve=solve: solve(matrices[row], vectors[row]),  # type: ignore[misc]
+                lambda row, solve=solve: solve(matrices[row], vectors[row]),
                 len(f),
                 2,
             )

@@ -24,7 +24,6 @@ def error(weights: Tensor, true: Tensor) -> float:
 
 
 def markers_of(take: Take) -> Tensor:
-    assert take.markers is not None
     return take.markers.values
 
 
@@ -102,9 +101,8 @@ def test_cleanup_and_whole_takes(real_capture: Capture) -> None:
         assert error(smooth_dirty, true) <= 0.65 * open_gaps
 
 
-def named_swaps(swaps: tuple[LabelSwap, ...], take: Take, defects) -> tuple[int, int]:  # type: ignore[no-untyped-def]
+def named_swaps(swaps: tuple[LabelSwap, ...], take: Take, defects) -> tuple[int, int]:
     """How many of the swaps that show are named over half of the frames in which they show; and of how many."""
-    assert take.markers is not None
     named, shown = 0, 0
     for swap in swaps:
         frames = torch.arange(swap.first, swap.last)
@@ -141,7 +139,6 @@ def test_slip(real_capture: Capture) -> None:
                 seconds = time.process_time() - started
                 shares.append(error(weights, true) / least)
                 motion = found if recording is slipping else motion
-        assert motion is not None
         off = (motion.translation - slipping.translation).abs().mean()
         turn = motion.rotation.transpose(1, 2) @ slipping.rotation.double()
         angle = torch.rad2deg(torch.arccos(((turn.diagonal(dim1=1, dim2=2).sum(1) - 1) / 2).clamp(-1, 1))).mean()

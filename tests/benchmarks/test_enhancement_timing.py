@@ -80,11 +80,9 @@ class Motions:
 def regions(performances: list[Path]) -> list[Motions]:
     """Features are displacements, exact in as many numbers as shapes."""
     rig = performer(texture=False)
-    assert rig.neutral.annotations is not None
     takes = []
     for path in performances:
         track = load_take(path).weights
-        assert track is not None
         takes.append((track.values[..., 0] @ mapping(track.names, rig.names).T).clamp(0, 1).double())
     every = []
     for name, parts in REGIONS.items():

@@ -47,7 +47,7 @@ def offsets(people: People) -> Tensor:
 
 
 def fit(people: People, form: str = "offsets") -> ExpressionRegression:
-    return ExpressionRegression.fit(people.neutrals, people.expressions, ExpressionSettings(form=form), people.names)  # type: ignore[arg-type]
+    return ExpressionRegression.fit(people.neutrals, people.expressions, ExpressionSettings(form=form), people.names)
 
 
 def test_table_1_for_the_smile(smile: People) -> None:

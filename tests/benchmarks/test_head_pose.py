@@ -157,7 +157,7 @@ def show(title: str, rows: dict[str, Row]) -> None:
 
 
 def robust(points: Tensor, pixels: Tensor, **settings: float | Tensor) -> Found:
-    found = robust_pnp(points, pixels, K, **settings)  # type: ignore[arg-type]
+    found = robust_pnp(points, pixels, K, **settings)
     return Found(found.pose.rotation, found.pose.translation, found.inliers)
 
 
@@ -182,7 +182,7 @@ def test_many_frames_at_once_beside_opencv(scene: str, print_machine: Callable[.
     found, spent = timed(lambda: robust(points, pixels))
     rows = {"torchface, all frames at once": Row.of(spent, found, rotation, translation)}
     for name, peer in PEERS.items():
-        found, spent = timed(lambda peer=peer: peer.poses(points, pixels))  # type: ignore[misc]
+        found, spent = timed(lambda peer=peer: peer.poses(points, pixels))
         rows[f"{name}, refined"] = Row.of(spent, found, rotation, translation)
     print_machine("opencv-contrib-python-headless")
     show(f"{scene}, 1 px of noise, 30 % of them up to 150 px wrong, {FRAMES} frames", rows)
@@ -208,7 +208,7 @@ def test_one_frame_at_a_time_beside_opencv(print_machine: Callable[..., None]) -
         found, spent = timed(alone)
         rows = {"torchface": Row.of(spent, found, rotation[:FEW], translation[:FEW])}
         for name, peer in PEERS.items():
-            found, spent = timed(lambda peer=peer, pixels=pixels: peer.poses(points, pixels))  # type: ignore[misc]
+            found, spent = timed(lambda peer=peer, pixels=pixels: peer.poses(points, pixels))
             rows[f"{name}, refined"] = Row.of(spent, found, rotation, translation)
         print_machine("opencv-contrib-python-headless")
         show(f"one frame at a time, 13 landmarks, 1 px of noise, {scene}", rows)
@@ -248,13 +248,13 @@ def test_temples_that_are_off_beside_opencv(print_machine: Callable[..., None]) 
         "AP3P, 4,000 draws, without temples": lambda q: many.poses(points[inner], q[:, inner], threshold),
     }
     for name, peer in PEERS.items():
-        ways[name] = lambda q, peer=peer: peer.poses(points, q, threshold)  # type: ignore[misc]
+        ways[name] = lambda q, peer=peer: peer.poses(points, q, threshold)
     print_machine("opencv-contrib-python-headless")
     print(f"13 landmarks, 0.7 px of noise, two temples 12 px off on one side, {FRAMES} frames; degrees")
     print(f"{'':36} {'ms/frame':>9} {'jump: most':>11} {'if steady':>10} {'error: mean':>12} {'if steady':>10}")
     jumps, errors = {}, {}
     for name, way in ways.items():
-        found, spent = timed(lambda way=way: way(shaky), 1)  # type: ignore[misc]
+        found, spent = timed(lambda way=way: way(shaky), 1)
         turns = [rotation_vector(each.rotation @ rotation.transpose(1, 2)) for each in (found, way(steady))]
         jumps[name] = [float(turn.diff(n=2, dim=0).norm(dim=1).max().rad2deg()) for turn in turns]
         errors[name] = [float(turn.norm(dim=1).mean().rad2deg()) for turn in turns]

@@ -95,7 +95,7 @@ def test_error_beside_dlib(faces: tuple[Faces, Faces], tmp_path: Path) -> None:
         seconds = time.process_time() - begin
 
         def theirs(number: int, predictor: object = predictor) -> np.ndarray:
-            shape = predictor(test.images[number].numpy(), rectangle(dlib, test.boxes[number]))  # type: ignore[operator]
+            shape = predictor(test.images[number].numpy(), rectangle(dlib, test.boxes[number]))
             return np.array([[part.x, part.y] for part in shape.parts()], dtype=np.float32)
 
         found = torch.from_numpy(np.stack([theirs(number) for number in range(len(test))]))
@@ -106,12 +106,12 @@ def test_error_beside_dlib(faces: tuple[Faces, Faces], tmp_path: Path) -> None:
     assert float(error.mean()) <= 1.05 * min(peers)
 
 
-def rectangle(dlib, box: Tensor):  # type: ignore[no-untyped-def]
+def rectangle(dlib, box: Tensor):
     x, y, width, height = (int(value) for value in box)
     return dlib.rectangle(x, y, x + width - 1, y + height - 1)
 
 
-def learned_by_dlib(dlib, learn: Faces, own_oversampling: bool):  # type: ignore[no-untyped-def]
+def learned_by_dlib(dlib, learn: Faces, own_oversampling: bool):
     """dlib's trees of the same sizes, from the same pictures and their mirror images."""
     options = dlib.shape_predictor_training_options()
     options.cascade_depth, options.num_trees_per_cascade_level = SETTINGS.cascades, SETTINGS.trees

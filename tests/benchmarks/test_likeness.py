@@ -52,7 +52,6 @@ def people(folder: Path) -> list[Pictured]:
     kind, modes = head_kinds(folder)[0][0], load_identity_modes(folder)
     rest = modes.neutral.vertices
     deltas = ict_head_model(folder).rig
-    assert deltas is not None
     result = []
     for number in range(PEOPLE):
         generator = torch.Generator().manual_seed(31_000_000 + number)
@@ -92,7 +91,6 @@ def normalised(fit: ImageFit, truth: Tensor) -> float:
 def test_likeness_of_rendered_people(ict_folder: Path) -> None:
     torch.set_num_threads(1)
     whole = ict_head_model(ict_folder)
-    assert whole.rig is not None
     face = region(whole.rig.neutral, "face")
     model, rig = whole.part(face), whole.rig.part(face)
     prior = load_priors(rig, DEFAULT_PRIOR, None).shapes

@@ -49,7 +49,6 @@ def test_poses_are_seen_and_a_narrow_smile_counts_as_a_whole_one(tmp_path: Path,
         settings = LiveSettings(str(path), record=out, calibrate=calibrate, page=False)
         go_live(settings, said.append if calibrate else str, str, person_solver)
         take = load_take(out / WEIGHTS)
-        assert take.weights is not None
         smiles[calibrate] = float(take.weights.select(POSES[2]).values[-20:].mean())
     print(
         f"\nleft out: {left_out}; the smile afterwards {smiles[True]:.2f} calibrated, {smiles[False]:.2f} not; {said}"

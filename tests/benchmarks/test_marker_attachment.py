@@ -36,14 +36,12 @@ def filmed(capture: Capture, take: int, seed: int, standoff: float, slips: bool 
     slip = {"slip_translation": 8.0, "slip_rotation": 3.0} if slips else {}
     flaws = StageFlaws(standoff=standoff, **slip)
     markers = record(rig, attachment, takes[take], torch.Generator().manual_seed(seed), flaws).take.markers
-    assert markers is not None
     return Take(60.0, markers=Track(markers.names, space(seed).apply(markers.values)))
 
 
 def weight_error(rig: BlendshapeRig, sites: Attachment, take: Take, true: Tensor) -> float:
     alignment = align_take(rig, sites, take)
     weights = MarkerSolver(rig, rest_residual(rig, sites, take, alignment), alignment).solve_take(take).weights
-    assert weights is not None
     return float((weights.values[..., 0] - true).abs().mean())
 
 

@@ -40,7 +40,6 @@ def frames(rig: BlendshapeRig, performances: list[Path]) -> Tensor:
     found = []
     for path in performances:
         track = load_take(path).weights
-        assert track is not None
         found.append((track.values[..., 0] @ mapping(track.names, rig.names).T).clamp(0, 1))
     weights = torch.cat(found)
     return weights[torch.linspace(0, len(weights) - 1, FRAMES).long()]

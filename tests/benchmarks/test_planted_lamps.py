@@ -75,7 +75,6 @@ def test_planted_lamps() -> None:
     for k in range(LAMPS):
         rig, brim = rigs[k % len(rigs)], k % 2 == 1
         take = perform(60, generator, fps=20.0)
-        assert take.weights is not None
         weights = take.weights.values[-1:, :, 0] @ mapping(take.weights.names, rig.names).T
         camera = turning_cameras(rig, 1, 20.0, generator, STAGE)[0]
         mesh = rig.neutral.with_vertices(rig(weights)[0])

@@ -19,7 +19,6 @@ def test_a_real_scan_with_landmarks_and_without(data: Path, ict_folder: Path) ->
     template = load_identity_modes(ict_folder, count=1, part="face").neutral
     scan = load_mesh(data / "scans" / "james" / "james.obj")
     points = load_landmark_points(data / "scans" / "james" / "james.ljson").ibug()
-    assert template.annotations is not None
     face = template.annotations.regions["narrow_face"]
     print(f"\n{'':>14}{'median mm':>11}{'mean':>8}{'95th':>8}{'on the scan':>13}{'s':>7}" + f"{'landmarks, mm:':>16}")
     shares = []

@@ -23,7 +23,7 @@ TIMES = 8  # that four seconds are played, forward and backward
 def seconds_of(work: object, *given: object) -> float:
     """Processor time."""
     start = time.process_time()
-    work(*given)  # type: ignore[operator]
+    work(*given)
     return time.process_time() - start
 
 
@@ -40,7 +40,7 @@ def test_the_whole_way(data: Path, tmp_path: Path) -> None:
     out, done = tmp_path / "out", []
 
     def track(overlay: str, path: Path = video.path) -> None:
-        done.append(track_video(path, tmp_path / "rig.glb", out, TrackSettings(overlay=overlay)))  # type: ignore[arg-type]
+        done.append(track_video(path, tmp_path / "rig.glb", out, TrackSettings(overlay=overlay)))
 
     track("none", film.path)  # graphs are made once
     whole = seconds_of(track, "none")

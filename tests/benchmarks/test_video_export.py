@@ -55,7 +55,6 @@ def test_the_graph_gives_the_weights_of_track(
     main(["export", "video-solver", *given, *chosen, *rate])
     session = onnxruntime.InferenceSession(graph, providers=["CPUExecutionProvider"])
     metadata = session.get_modelmeta().custom_metadata_map
-    assert tracked.offsets is not None
     usual = replace(VideoSettings.of_found_landmarks(remembers), relative_noise=tracked.offsets.noise)
     assert json.loads(metadata["settings"]) == asdict(usual)
     apart = played(session, tracked) - tracked.solution.weights

@@ -127,7 +127,6 @@ def example(content: bytes, video: Path, folder: Path) -> tuple[float, float]:
     (folder / "webcam.onnx").write_bytes(content)
     (folder / "example.py").write_text(code)
     values = figures([sys.executable, "example.py"], folder)
-    assert values is not None
     return values[0], values[1]
 
 

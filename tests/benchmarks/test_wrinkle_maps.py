@@ -20,8 +20,6 @@ def planted() -> ModuleType:
     """The head with wrinkles that the tests of ``modeling.detail`` use."""
     file = Path(__file__).resolve().parents[1] / "modeling" / "detail" / "test_normal_map_baking.py"
     specification = importlib.util.spec_from_file_location("planted_wrinkles", file)
-    assert specification is not None
-    assert specification.loader is not None
     module = importlib.util.module_from_spec(specification)
     specification.loader.exec_module(module)
     return module

@@ -41,9 +41,7 @@ def vertex_error(person: Person, solved: Tensor, truth: Tensor, seen: Tensor) ->
 
 def signal(weights: Tensor, name: str) -> Tensor:
     """One of ``SIGNALS`` of weights (T,52), (T,)."""
-    return sum(  # type: ignore[return-value]
-        share * weights[:, ARKIT.index(shape)] for shape, share in SIGNALS[name].items()
-    )
+    return sum(share * weights[:, ARKIT.index(shape)] for shape, share in SIGNALS[name].items())
 
 
 def follows(solved: Tensor, truth: Tensor, name: str, seen: Tensor) -> Agreement:

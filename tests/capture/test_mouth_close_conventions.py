@@ -26,8 +26,6 @@ def rig() -> BlendshapeRig:
 
 def test_conventions_are_told_apart_by_the_chin(rig: BlendshapeRig) -> None:
     arkit, other = mouth_close_of(rig), mouth_close_of(jaw_opened(rig))
-    assert arkit is not None
-    assert other is not None
     assert (arkit.opens_jaw, other.opens_jaw) == (False, True)
     assert abs(arkit.share) < 0.1
     assert abs(other.share - 1) < 0.1
@@ -65,10 +63,8 @@ def test_closed_lips_over_a_closed_jaw_are_warned_of() -> None:
 def test_a_real_rig_is_arkits_and_plays_alike_in_the_other(ict_folder: Path, performances: list[Path]) -> None:
     rig = load_rig(ict_folder, shapes=["jawOpen", "mouthClose"])
     found = mouth_close_of(rig)
-    assert found is not None
     assert not found.opens_jaw
     take = load_take(performances[0]).weights
-    assert take is not None
     track = take.select(["JawOpen", "MouthClose"] if "JawOpen" in take.names else ["jawOpen", "mouthClose"])
     other = jaw_opened(rig)
     kept = (track.values[:, 0] >= track.values[:, 1])[:, 0].nonzero()[::50, 0]

@@ -120,7 +120,6 @@ def test_any_text_is_a_table_or_refused(tmp_path_factory: pytest.TempPathFactory
 def test_a_real_performance_reaches_every_shape_that_both_rigs_have(ict_folder: Path, performances: list[Path]) -> None:
     rig = load_rig(ict_folder, part="face")
     track = load_take(performances[0]).weights
-    assert track is not None
     shapes = shape_map(track.names, rig.names)
     assert set(shapes.undriven) == {"cheekRaiser_L", "cheekRaiser_R"} & set(rig.names)
     assert set(shapes.unused) == {"TongueOut"}

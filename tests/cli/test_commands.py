@@ -64,13 +64,11 @@ def test_solve_writes_the_weights_that_the_solver_finds(shoot: Path, dome_rig: B
     torch.testing.assert_close(found, torch.load(shoot / "true.pt", weights_only=True), atol=0.06, rtol=0)
     solver, take = MarkerSolver(load_rig(shoot / "rig.glb"), place_markers(dome_rig, 30)), load_take(shoot / "take.c3d")
     smooth = WholeTakeSolver(solver).solve_take(take).weights
-    assert smooth is not None
     torch.testing.assert_close(found, smooth.values[..., 0].float(), atol=1e-5, rtol=0)
     common = ("--attachment", shoot / "attachment.json", "--out", out, "--quiet")
     run("solve", shoot / "rig.glb", shoot / "take.c3d", *common, "--frame-by-frame")
     written, single = load_take(out).weights, solver.solve_take(take).weights
     assert written is not None
-    assert single is not None
     frames = dome_rig.weights_from(written).float()
     torch.testing.assert_close(frames, single.values[..., 0].float(), atol=1e-5, rtol=0)
     assert weight_jitter(found) < weight_jitter(frames)
@@ -78,7 +76,6 @@ def test_solve_writes_the_weights_that_the_solver_finds(shoot: Path, dome_rig: B
 
 def test_solve_with_a_neutral_frame_undoes_the_space_of_the_take(shoot: Path, dome_rig: BlendshapeRig) -> None:
     take = load_take(shoot / "take.c3d")
-    assert take.markers is not None
     angle = torch.tensor(0.7)
     rotation = torch.tensor([[angle.cos(), -angle.sin(), 0], [angle.sin(), angle.cos(), 0], [0, 0, 1]])
     space = Similarity(torch.tensor([1.1]), rotation[None], torch.tensor([[100.0, -900, 40]]))
@@ -273,7 +270,6 @@ def test_solve_cleans_a_slipping_take_and_reports_it(
     weights = 0.5 + 0.5 * torch.sin(torch.arange(240)[:, None] / 9 + torch.arange(4))
     flaws = StageFlaws(noise=0.05, missing=0.02, slip_translation=6, slip_rotation=3)
     recording = record(dome_rig, attachment, weights, torch.Generator().manual_seed(0), flaws)
-    assert recording.take.markers is not None
     values = recording.take.markers.values.clone()
     values[100:130, [3, 20]] = values[100:130, [20, 3]]
     save_take(Take(60.0, markers=Track(recording.take.markers.names, values)), shoot / "dirty.c3d")
@@ -293,7 +289,6 @@ def test_solve_cleans_a_slipping_take_and_reports_it(
 
 def test_solve_aligns_a_take_without_a_neutral_frame(shoot: Path, dome_rig: BlendshapeRig) -> None:
     take = load_take(shoot / "take.c3d")
-    assert take.markers is not None
     space = Similarity(torch.tensor([1.0]), torch.eye(3)[None], torch.tensor([[100.0, -900, 40]]))
     moved = Track(take.markers.names, space.apply(take.markers.values))
     save_take(Take(take.fps, markers=moved), shoot / "moved.c3d")
@@ -343,7 +338,6 @@ def test_attach_cleans_takes_slip_out_and_refuses_markers_off_the_skin(
     weights = 0.5 + 0.5 * torch.sin(torch.arange(300)[:, None] * torch.tensor([0.05, 0.11, 0.17, 0.23]))
     slip = StageFlaws(noise=0.05, slip_translation=8, slip_rotation=3)
     markers = record(dome_rig, true, weights, torch.Generator().manual_seed(0), slip).take.markers
-    assert markers is not None
     swapped = markers.values.clone()
     swapped[100:130, [3, 20]] = markers.values[100:130, [20, 3]]
     save_take(Take(60.0, markers=Track(markers.names, swapped)), shoot / "dirty.c3d")

@@ -36,7 +36,6 @@ def one_frame(rig: BlendshapeRig, weights: Tensor) -> Tensor:
     vertices = rig.vertices.double().clone()
     for name, delta in zip(rig.names, rig.deltas, strict=True):
         vertices += w[name] * delta
-    assert rig.correctives is not None
     for definition, delta in zip(rig.correctives.definitions, rig.correctives.deltas, strict=True):
         if definition.peak is None:
             on = 1.0
@@ -65,7 +64,6 @@ def test_a_batch_is_what_a_loop_over_correctives_gives() -> None:
 
 def test_in_betweens_join_samples_by_straight_lines() -> None:
     rig = corrective_rig()
-    assert rig.correctives is not None
     a25, a75 = rig.correctives.deltas[2], rig.correctives.deltas[3]
     samples = [0 * a25, 0.25 * rig.deltas[0] + a25, 0.75 * rig.deltas[0] + a75, rig.deltas[0]]
     weights = torch.zeros(5, 4)
@@ -93,13 +91,11 @@ def test_correctives_follow_their_rig() -> None:
     weights = torch.rand(3, 4, generator=torch.Generator().manual_seed(3))
     torch.testing.assert_close(rig.part(torch.tensor([2, 3, 4, 5]))(weights), rig(weights)[:, 2:])
     some = rig.select(["c", "a", "b"])
-    assert some.correctives is not None
     assert some.correctives.names == ("ab", "a25", "a75", "c40")
     weights[:, 3] = 0.0
     torch.testing.assert_close(some(weights[:, [2, 0, 1]]), rig(weights))
     assert rig.select(["d"]).correctives is None
     precise = rig.double()
-    assert precise.correctives is not None
     assert precise.correctives.deltas.dtype == torch.float64
     assert set(precise.state_dict()) == {"vertices", "deltas", "corrective_deltas"}
 
@@ -117,7 +113,6 @@ def test_merged_halves_keep_what_their_correctives_showed() -> None:
     correctives = Correctives(torch.randn(4, 3, 3, generator=generator), definitions)
     rig = BlendshapeRig(neutral, torch.randn(3, 3, 3, generator=generator), names, correctives)
     merged = rig.with_arkit_names()
-    assert merged.correctives is not None
     assert merged.correctives.names == ("left_jaw", "right_third", "left_half")
     weights = torch.rand(9, 2, generator=generator)
     whole = dict(zip(merged.names, range(2), strict=True))

@@ -113,7 +113,6 @@ def test_a_checkpoint_belongs_to_one_thing(tmp_path: Path) -> None:
     assert read_checkpoint(path, key) is None
     write_checkpoint(path, {"x": torch.arange(6.0).view(2, 3).T}, key)
     found = read_checkpoint(path, key)
-    assert found is not None
     assert found["x"].equal(torch.arange(6.0).view(2, 3).T)
     assert read_checkpoint(path, content_key("test/1", of="b")) is None
     whole = path.read_bytes()

@@ -32,7 +32,6 @@ def test_another_process_is_refused_by_name_until_it_is_killed(lock: Lock, tmp_p
     other = subprocess.Popen(
         [sys.executable, "-c", HOLD.format(lock=lock.__name__), out], stdout=subprocess.PIPE, text=True
     )
-    assert other.stdout is not None
     assert other.stdout.readline() == "held\n"
     there = sorted(tmp_path.rglob("*"))
     expected = rf"another run writing into .*out \(process {other.pid} on .*\), expected none"

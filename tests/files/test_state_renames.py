@@ -148,7 +148,7 @@ def test_a_key_under_both_names_is_refused(tmp_path: Path) -> None:
 
 
 def test_configs_are_renamed_at_any_depth(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(CONFIG_RENAMES, "made", {"rounds": "iterations"})  # type: ignore[arg-type]
+    monkeypatch.setitem(CONFIG_RENAMES, "made", {"rounds": "iterations"})
     old = {"rounds": 1, "parts": [{"rounds": [2]}, {"rounds": 3, "iterations": 4}], "names": ["rounds"]}
     new = {"iterations": 1, "parts": [{"iterations": [2]}, {"rounds": 3, "iterations": 4}], "names": ["rounds"]}
     assert current_config("made", old) == new

@@ -17,7 +17,7 @@ def dlib_files(draw: st.DrawFn) -> Files:
     ) -> st.SearchStrategy[str]:
         pairs = [
             seldom(st.just(""), value.map(lambda v, k=key: f" {k}='{v}'"), 30) for key, value in attributes.items()
-        ]  # type: ignore[misc]
+        ]
         return st.tuples(st.tuples(*pairs).map("".join), inner).map(lambda made: f"<{name}{made[0]}>{made[1]}</{name}>")
 
     number, part_name = numbers(), seldom(numbers(), st.integers(0, 5).map(str), 20)

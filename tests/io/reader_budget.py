@@ -140,7 +140,7 @@ def find_reader(job: dict[str, Any]) -> Callable[..., Any]:
         module = importlib.util.module_from_spec(spec)
         sys.modules["reader_under_test"] = module
         spec.loader.exec_module(module)
-    return getattr(module, job["reader"])  # type: ignore[no-any-return]
+    return getattr(module, job["reader"])
 
 
 def limit_memory(megabytes: float) -> None:

@@ -72,7 +72,7 @@ def columns_of(rotation: Tensor) -> list[float]:
     """A transform's 16 numbers by columns."""
     whole = torch.eye(4, dtype=torch.float64)
     whole[:3, :3] = rotation
-    return whole.T.flatten().tolist()  # type: ignore[no-any-return]
+    return whole.T.flatten().tolist()
 
 
 def turned_about_arkits_axes(degrees_xyz: list[float]) -> Tensor:

@@ -24,9 +24,9 @@ def test_markers_go_to_the_format_of_the_suffix(suffix: str, tmp_path: Path) -> 
     take = Take(100.0, markers=_markers())
     save_take(take, tmp_path / f"take{suffix}")
     back = load_take(tmp_path / f"take{suffix}")
-    assert torch.equal(back.markers.values, take.markers.values)  # type: ignore[union-attr]
+    assert torch.equal(back.markers.values, take.markers.values)
     in_metres = load_take(tmp_path / f"take{suffix}", unit="m")
-    torch.testing.assert_close(in_metres.markers.values, 1000 * take.markers.values)  # type: ignore[union-attr]
+    torch.testing.assert_close(in_metres.markers.values, 1000 * take.markers.values)
 
 
 @pytest.mark.parametrize(
@@ -37,9 +37,8 @@ def test_only_arkits_whole_set_becomes_a_live_link_file(names: tuple[str, ...], 
     save_take(take, tmp_path / "take.csv")
     assert (tmp_path / "take.csv").read_text().startswith(first)
     back = load_take(tmp_path / "take.csv").weights
-    assert back is not None
     assert [name.lower() for name in back.names] == [name.lower() for name in names]
-    assert torch.equal(back.values, take.weights.values)  # type: ignore[union-attr]
+    assert torch.equal(back.values, take.weights.values)
 
 
 def test_a_csv_holds_the_weights_or_the_one_track_there_is(tmp_path: Path) -> None:
@@ -47,7 +46,6 @@ def test_a_csv_holds_the_weights_or_the_one_track_there_is(tmp_path: Path) -> No
     save_take(take, tmp_path / "take.csv")
     back = load_take(tmp_path / "take.csv")
     assert back.markers is None
-    assert back.weights is not None
     assert back.weights.names == ("smile",)
     landmarks = Track(("nose", "chin"), torch.zeros(4, 2, 2))
     with pytest.raises(ValueRangeError, match=r"take\.csv: found a take of markers and landmarks, expected one"):
@@ -94,7 +92,6 @@ def planted(names: tuple[str, ...]) -> Take:
 @pytest.mark.parametrize("names", [ARKIT, ("one", "two")], ids=["Live Link", "plain"])
 def test_percent_and_degrees_are_converted_and_said(names: tuple[str, ...], tmp_path: Path) -> None:
     take = planted(names)
-    assert take.weights is not None
     columns = {name: column * 180 / math.pi for name, column in take.extras["columns"].items()}
     percent = Track(names, 100 * take.weights.values)
     save_take(replace(take, weights=percent, extras={"columns": columns}), tmp_path / "take.csv")
@@ -103,7 +100,6 @@ def test_percent_and_degrees_are_converted_and_said(names: tuple[str, ...], tmp_
     texts = [str(one.message) for one in said]
     assert any("found weights up to 9" in text and "taken for percent" in text for text in texts)
     assert any("rotations up to 51.57, expected radians; they are taken for degrees" in text for text in texts)
-    assert found.weights is not None
     torch.testing.assert_close(found.weights.values, take.weights.values)
     for name in ROTATIONS:
         torch.testing.assert_close(found.extras["columns"][name], take.extras["columns"][name])
@@ -111,7 +107,6 @@ def test_percent_and_degrees_are_converted_and_said(names: tuple[str, ...], tmp_
 
 def test_usual_units_and_single_wild_frames_stay(tmp_path: Path) -> None:
     take = planted(("one", "two"))
-    assert take.weights is not None
     values = take.weights.values.clone().repeat(3, 1, 1)
     values[7] = 80.0
     columns = {name: column.repeat(3) for name, column in take.extras["columns"].items()}
@@ -120,7 +115,6 @@ def test_usual_units_and_single_wild_frames_stay(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = load_take(tmp_path / "take.csv")
-    assert found.weights is not None
     assert found.weights.values.equal(values)
     assert found.extras["columns"]["HeadYaw"].equal(columns["HeadYaw"])
 

@@ -66,7 +66,6 @@ def test_animations_give_the_times_back(name: str, kind: str, tmp_path: Path) ->
     weights = torch.rand(len(seconds), len(rig.names), 1, generator=torch.Generator().manual_seed(0))
     save_animation(rig, Take(30.0, weights=Track(rig.names, weights), seconds=seconds), tmp_path / name)
     found = load_animation(tmp_path / name)
-    assert found is not None
     torch.testing.assert_close(found.times, seconds - seconds[0], atol=1e-6, rtol=0)
     assert found.weights.values.equal(weights)
 

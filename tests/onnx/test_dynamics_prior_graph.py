@@ -21,7 +21,6 @@ def prior(request: pytest.FixtureRequest) -> DynamicsPrior:
     takes = []
     for seed in range(2):
         track = perform(240, torch.Generator().manual_seed(seed)).weights
-        assert track is not None
         takes.append(track.values[..., 0])
     settings = DynamicsSettings(inducing=30, subset=200, iterations=5)
     return DynamicsPrior.fit(takes, track.names, request.param, input_noise=0.01, settings=settings)
@@ -39,7 +38,6 @@ def test_the_graph_predicts_as_the_module(prior: DynamicsPrior, report: ExportRe
     assert "ONNX Runtime against PyTorch" in str(report)
     session = onnxruntime.InferenceSession(report.path, providers=["CPUExecutionProvider"])
     track = perform(300, torch.Generator().manual_seed(9)).weights
-    assert track is not None
     windows = track.values[..., 0].unfold(0, prior.window, 1).transpose(1, 2).contiguous()
     mean, deviation = session.run(["mean", "deviation"], {"windows": windows.numpy()})
     expected, variance = prior(windows)

@@ -62,8 +62,8 @@ def test_eyes_in_a_small_file(tmp_path: Path) -> None:
     network = EyeNetwork()
     for module in network.modules():  # statistics and heads as after training, not as initialised
         if isinstance(module, torch.nn.BatchNorm2d):
-            module.running_mean.normal_(0, 0.2)  # type: ignore[union-attr, operator]
-            module.running_var.uniform_(0.5, 2)  # type: ignore[union-attr, operator]
+            module.running_mean.normal_(0, 0.2)
+            module.running_var.uniform_(0.5, 2)
     torch.nn.init.normal_(network.local, 0, 0.3)
     report = export_model(network, tmp_path / "eyes.onnx")
     assert set(report.parity) == {"landmarks", "iris", "deviation", "openness", "closed", "visibility"}

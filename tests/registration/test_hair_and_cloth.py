@@ -28,7 +28,6 @@ def head() -> Mesh:
 
 @pytest.fixture(scope="module")
 def region(head: Mesh) -> dict[str, Tensor]:
-    assert head.annotations is not None
     return head.annotations.regions
 
 
@@ -61,7 +60,6 @@ def test_hair_is_no_skull(haired: Registration, truth: Tensor, region: dict[str,
 
 def test_hair_is_not_painted_on_the_skull(haired: Registration, region: dict[str, Tensor]) -> None:
     colors = haired.mesh.colors
-    assert colors is not None
     assert float((colors[region["cranium"]] - torch.tensor(SKIN)).norm(dim=1).quantile(0.95)) < 0.1
     assert not any("colours" in note for note in haired.record.notes)
 

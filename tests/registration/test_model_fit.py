@@ -87,7 +87,7 @@ def test_models_of_something_else_are_refused(mask: Mesh, waves: Waves, make_mas
     with pytest.raises(TopologyError, match="expected the template's topology"):
         register(turned, mask, model=heads)
     with pytest.raises(ShapeError, match="found str, expected a model"):
-        register(mask, mask, model="heads")  # type: ignore[arg-type]
+        register(mask, mask, model="heads")
 
 
 @pytest.mark.usefixtures("coarse_figures")

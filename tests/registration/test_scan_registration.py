@@ -224,7 +224,7 @@ def test_a_detector_is_asked_where_no_landmarks_are_given(
 ) -> None:
     seen: list[Tensor] = []
 
-    def detector(laid: Mesh, surface: Mesh, pose) -> Landmarks | None:  # type: ignore[no-untyped-def]
+    def detector(laid: Mesh, surface: Mesh, pose) -> Landmarks | None:
         seen.append((laid.vertices - truth).norm(dim=1).mean())
         assert surface is scan
         return landmarks

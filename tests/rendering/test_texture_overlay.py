@@ -59,7 +59,6 @@ def over_vertices(mesh: Mesh, values: Tensor, size: int = 512) -> Tensor:
 
 
 def region(mesh: Mesh, name: str) -> Tensor:
-    assert mesh.annotations is not None
     return mesh.annotations.regions[name]
 
 
@@ -84,7 +83,6 @@ def grown(mask: Tensor) -> Tensor:
 def test_paint_of_the_skins_own_colours_is_not_seen(rig: BlendshapeRig, cameras: tuple[Camera, ...]) -> None:
     """The skin's texture as paint, in the film's light, gives the film again: shading, shadows and place are right."""
     mesh = rig.neutral
-    assert mesh.texture is not None
     paint = FacePaint.of(mesh, torch.cat([mesh.texture, torch.ones(1, *mesh.texture.shape[1:])]))
     for camera in cameras[:2]:
         frame = film(mesh, camera, LIGHT)

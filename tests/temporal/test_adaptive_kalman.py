@@ -164,7 +164,6 @@ def test_less_jitter_live_and_hardly_any_afterwards(face: Tensor) -> None:
 @pytest.mark.real
 def test_a_real_face_is_followed(data: Path) -> None:
     take = load_take(data / "landmarks" / "openface_100_frames.csv")
-    assert take.landmarks is not None
     values = take.landmarks.values.double()
     live, smoothed = adaptive_filter(values, LANDMARK_SETTINGS), adaptive_smoother(values, LANDMARK_SETTINGS)
     for found in (live, smoothed):

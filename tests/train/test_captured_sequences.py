@@ -34,7 +34,7 @@ def archive(path: Path, vertices: bytes) -> Path:
 @pytest.mark.parametrize("order", ["C", "F"])
 @pytest.mark.parametrize("kind", ["<f4", ">f4", "<f8"])
 def test_every_layout_is_read(tmp_path: Path, kind: str, order: str) -> None:
-    vertices = np.asarray(VERTICES.astype(kind), order=order)  # type: ignore[call-overload]
+    vertices = np.asarray(VERTICES.astype(kind), order=order)
     np.savez_compressed(tmp_path / "a.npz", vertices=vertices, faces=FACES)
     found = _animated(tmp_path / "a.npz")
     np.testing.assert_array_equal(found.read(1, 3), VERTICES[1:3])

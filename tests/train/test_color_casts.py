@@ -57,7 +57,6 @@ def test_colours_under_any_light_come_out_the_same(people: torch.Tensor, photogr
 
 def test_make_up_of_one_does_not_count_as_light(people: torch.Tensor) -> None:
     mesh = neutral_head(texture=False)
-    assert mesh.annotations is not None
     painted = people.clone()
     painted[3, mesh.annotations.regions["forehead"]] *= torch.tensor([0.3, 0.3, 0.9])
     before, after = color_casts(people), color_casts(painted)
@@ -70,7 +69,6 @@ def test_texture_areas_are_shares_of_the_texels() -> None:
     areas = texture_areas(mesh)
     assert float(areas.sum()) == pytest.approx(1)
     assert (areas >= 0).all()
-    assert mesh.uvs is not None
     assert torch.allclose(texture_areas(replace(mesh, uvs=0.5 * mesh.uvs)), areas, atol=1e-7)
     with pytest.raises(TopologyError, match="no texture coordinates"):
         texture_areas(replace(mesh, uvs=None, uv_faces=None))

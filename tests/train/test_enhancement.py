@@ -60,7 +60,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def settings(folder: Path, **other: object) -> Settings:
-    return Settings(frames=folder, out=folder.parent / "model", patch=12, regions=3, rank=9, held_out=1, **other)  # type: ignore[arg-type]
+    return Settings(frames=folder, out=folder.parent / "model", patch=12, regions=3, rank=9, held_out=1, **other)
 
 
 def test_all_forms_of_sequences_are_read_alike(folder):

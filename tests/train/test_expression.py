@@ -56,7 +56,6 @@ def trained(pairs: Path, tmp_path_factory: pytest.TempPathFactory) -> tuple[Trai
 
 def test_the_law_is_found(trained: tuple[Trained, Path]) -> None:
     comparison = trained[0].comparison
-    assert comparison is not None
     assert comparison.squared.shape == (8, 2, 3)
     assert comparison.counts[2] >= 14
     assert comparison.sums[2] < 0.1 * comparison.sums[1]
@@ -139,7 +138,6 @@ def test_of_many_people_the_last_are_left_out_together(
     monkeypatch.setattr(expression_table, "_MANY", 7)
     monkeypatch.setattr(expression_table, "_TESTED", 2)
     found = train(Settings(pairs=pairs, out=tmp_path / "own", pictured=0)).comparison
-    assert found is not None
     assert (len(found.squared), found.learned) == (2, 6)
     rest = gather(Settings(pairs=pairs), tmp_path / "work", silent).first(6)
     assert rest.who[-1] == "person5"

@@ -53,7 +53,7 @@ def test_mistakes_are_cut_out_of_pictures_without_people() -> None:
     """A network that takes every cell for a face errs in each picture; what is cut out shows no face to learn."""
     network = BoxNetwork((4, 4, 4, 4), (1, 1, 1, 1), faces=4)
     with torch.no_grad():
-        network.said.bias[0] = 3.0  # type: ignore[index]
+        network.said.bias[0] = 3.0
     pieces = mined_pieces(network.eval(), 3, 64, 1)
     assert len(pieces) >= 3
     assert all(piece.shape == (64, 64, 3) for piece in pieces)

@@ -59,7 +59,6 @@ def test_shapes_and_units_of_the_tables_exist() -> None:
 
 def test_a_take_is_its_seed(weights: Tensor) -> None:
     again = converse(900, torch.Generator().manual_seed(0), 30.0).weights
-    assert again is not None
     assert torch.equal(again.values[..., 0], weights[:900])
     assert float(weights.min()) >= 0
     assert float(weights.max()) <= 1
@@ -75,6 +74,5 @@ def test_real_takes_are_likelier_than_under_a_prior_of_gestures(performances: li
     ).double()
     for path in performances:
         track = load_take(path).weights
-        assert track is not None
         real = (track.values[..., 0].double() @ mapping(track.names, prior.names).double().T).clamp(0, 1)
         assert float(prior.log_density(real).mean() - of_gestures.log_density(real).mean()) > 30, path.name

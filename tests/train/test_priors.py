@@ -121,7 +121,6 @@ def test_marker_takes_are_solved(tmp_path: Path) -> None:
 
 
 def shapes(take: Take, rig: BlendshapeRig) -> Tensor:
-    assert take.weights is not None
     return take.weights.values[..., 0] @ mapping(take.weights.names, rig.names).T
 
 
@@ -192,7 +191,6 @@ def test_bad_input(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(TorchfaceError, match="for a window of 40"):
         train(Settings(performances=2, frames=30, kind="dynamics", window=40, out=tmp_path / "own"))
     take = saved(tmp_path, "a", 20)
-    assert take.weights is not None
     other = Track(("jawWide", *take.weights.names[1:]), take.weights.values)
     save_take(Take(60.0, weights=other), tmp_path / "b.csv")
     with pytest.raises(NameMismatchError, match=r"b\.csv: found other shapes than in a\.csv \(jawWide"):

@@ -304,7 +304,7 @@ def test_tensorboard_is_told_where_it_is_installed(tmp_path: Path, monkeypatch: 
         def close(self) -> None: ...
 
     module = types.ModuleType("torch.utils.tensorboard")
-    module.SummaryWriter = Writer  # type: ignore[attr-defined]
+    module.SummaryWriter = Writer
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", module)
     log = RunLog(tmp_path)
     log(50, "loss", 0.5)

@@ -42,6 +42,6 @@ def test_a_damaged_or_foreign_take_is_made_again(tmp_path: Path, damage: bytes |
         found = store.stored("key", lambda: TAKE)
     torch.testing.assert_close(found.weights.float(), TAKE.weights)
     made: list[StoredTake] = []
-    TakeStore(tmp_path, 1).stored("key", lambda: made.append(TAKE) or TAKE)  # type: ignore[func-returns-value]
+    TakeStore(tmp_path, 1).stored("key", lambda: made.append(TAKE) or TAKE)
     assert not made
     torch.testing.assert_close(store.takes()[0].float(), TAKE.weights)

@@ -43,7 +43,6 @@ def test_wrinkle_maps_by_region_stay_in_a_glb_and_are_named_where_there_is_no_pl
     save_rig(sheet_rig(), tmp_path / "rig.glb", maps)
     assert convert_file(tmp_path / "rig.glb", tmp_path / "again.glb").notes == ()
     again = load_region_maps(tmp_path / "again.glb")
-    assert again is not None
     assert again.regions == maps.regions
     notes = convert_file(tmp_path / "rig.glb", tmp_path / "folder").notes
     assert notes == ("folder has no place for wrinkle maps by region, which are left out; .glb has",)

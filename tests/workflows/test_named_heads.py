@@ -51,9 +51,6 @@ def test_charts_of_an_ict_head_do_not_cover_each_other(data: Path) -> None:
     rig = load_ict_facekit(data / "ict_facekit" / "FaceXModel", shapes=["jawOpen"])
     shape = MorphableModel(rig.vertices, torch.zeros(1, *rig.vertices.shape), torch.ones(1))
     mesh = matching(HeadModel.on(rig.neutral, shape, rig=rig))[1].neutral
-    assert mesh.annotations is not None
-    assert mesh.uvs is not None
-    assert mesh.uv_faces is not None
     assert 0 <= float(mesh.uvs.min()) <= float(mesh.uvs.max()) <= 1
     names = ("face", "head_and_neck", "eyeball_left", "eyeball_right", "teeth", "gums_and_tongue")
     inside = [mesh.annotations.regions[name][mesh.faces].all(1) for name in names]

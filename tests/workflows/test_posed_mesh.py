@@ -79,7 +79,6 @@ def test_a_broken_corrective_is_an_error_and_no_rig_without_shapes(
         path.write_bytes(data[:8] + (12 + len(body)).to_bytes(4, "little") + body)
     else:
         notes = re.search(r"string torchface = '(.*correctives.*)'$", data.decode(), re.MULTILINE)
-        assert notes is not None
         record = json.loads(notes[1])
         record["correctives"][0].update(change)
         path.write_text(data.decode().replace(notes[1], json.dumps(record)))

@@ -26,19 +26,16 @@ def test_the_jaw_is_opened_once(tmp_path: Path) -> None:
     weights = torch.tensor([[0.8, 0.5, 0.1], [0.3, 0.3, 0.9]])
     save_take(Take(60.0, weights=Track(rig.names, weights[..., None])), tmp_path / "take.csv")
     done = retarget_weights(tmp_path / "take.csv", tmp_path / "other.glb", WeightFiles(tmp_path / "out.csv"))
-    assert done.take.weights is not None
     torch.testing.assert_close(other(done.take.weights.values[..., 0]), rig(weights), atol=1e-3, rtol=0)
     assert any("opens the jaw itself" in warning for warning in done.warnings)
     back = retarget_weights(
         tmp_path / "out.csv", tmp_path / "arkit.glb", WeightFiles(tmp_path / "back.csv"), tmp_path / "other.glb"
     )
-    assert back.take.weights is not None
     torch.testing.assert_close(back.take.weights.values[..., 0], weights, atol=1e-4, rtol=0)
     table = tmp_path / "table.toml"
     table.write_text("[jawOpen]\nsum = {jawOpen = 1.0}\n")
     written = WeightFiles(tmp_path / "ruled.csv")
     ruled = retarget_weights(tmp_path / "take.csv", tmp_path / "other.glb", written, table=table)
-    assert ruled.take.weights is not None
     torch.testing.assert_close(ruled.take.weights.values[..., 0], weights, atol=1e-4, rtol=0)
 
 
@@ -89,7 +86,6 @@ def test_uneven_times_go_with_the_weights(tmp_path: Path) -> None:
     main([str(word) for word in words])
     written = [load_take(tmp_path / "out.csv"), load_take(tmp_path / "live.csv"), load_animation(tmp_path / "out.glb")]
     for found in written:
-        assert found is not None
         torch.testing.assert_close(found.times, seconds - seconds[0], atol=2e-5, rtol=0)
 
 

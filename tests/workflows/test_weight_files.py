@@ -47,7 +47,6 @@ def solve(stage: Path, rig: str, *more: str | Path) -> Path:
 
 def values(path: Path) -> torch.Tensor:
     track = load_take(path).weights
-    assert track is not None
     return track.values
 
 
@@ -62,7 +61,6 @@ def test_a_rig_with_names_of_its_own_is_solved_into_a_plain_table(stage: Path) -
     out = solve(stage, "own")
     assert out.read_text().startswith("frame,time,ctrl_a,ctrl_b,ctrl_c,ctrl_d\n")
     arkit = load_take(solve(stage, "arkit")).weights
-    assert arkit is not None
     same = arkit.select([name[0].upper() + name[1:] for name in DOME])
     torch.testing.assert_close(values(out), same.values)
 
@@ -107,9 +105,8 @@ def test_a_plain_table_keeps_timecode_and_rotations_to_the_bit(tmp_path: Path) -
     take = replace(phone_take(), weights=Track(OWN, torch.rand(30, 4, 1)))
     save_weights_csv(take, tmp_path / "take.csv")
     back = load_take(tmp_path / "take.csv")
-    assert back.weights is not None
     assert back.weights.names == OWN
-    assert torch.equal(back.weights.values, take.weights.values)  # type: ignore[union-attr]
+    assert torch.equal(back.weights.values, take.weights.values)
     assert back.timecode == TIMECODE
     assert back.extras["columns"].keys() == set(ROTATIONS)
     for name, column in take.extras["columns"].items():
@@ -137,7 +134,7 @@ def test_a_solved_take_is_saved_as_its_weights(stage: Path, dome_rig: Blendshape
     rig = BlendshapeRig(dome_rig.neutral, dome_rig.deltas, OWN)
     solved = MarkerSolver(rig, place_markers(dome_rig, 30)).solve_take(load_take(stage / "take.c3d"))
     save_take(solved, stage / "solved.csv")
-    assert torch.equal(values(stage / "solved.csv"), solved.weights.values)  # type: ignore[union-attr]
+    assert torch.equal(values(stage / "solved.csv"), solved.weights.values)
 
 
 def test_what_is_wrong_with_weights_is_told_by_shape_and_frame() -> None:
@@ -194,7 +191,6 @@ def test_a_frame_without_a_face_stays_one(stage: Path, tmp_path: Path, capsys: p
     assert "2 weights are missing, of jawOpen, browInnerUp" in shown
     assert "1 weights are below 0 or above 1, of jawOpen" in shown
     moved = load_take(tmp_path / "out.csv").weights
-    assert moved is not None
     assert moved.values.isnan().all(1)[:, 0].tolist() == [False, False, False, True, False]
     assert torch.isfinite(moved.values[[0, 1, 2, 4]]).all()
     with pytest.raises(SystemExit):
@@ -214,7 +210,6 @@ def test_weights_go_to_a_csv_only(stage: Path, tmp_path: Path, capsys: pytest.Ca
 
 def lines_at(keys: Take, times: torch.Tensor) -> np.ndarray:
     """What straight lines between a take's keys are at some times, (T,N)."""
-    assert keys.weights is not None
     rows = keys.weights.values[..., 0].double().T.numpy()
     return np.stack([np.interp(times.numpy(), keys.times.numpy(), row) for row in rows], 1)
 

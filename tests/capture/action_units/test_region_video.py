@@ -22,7 +22,7 @@ def test_a_region_of_its_own_size_is_a_cut() -> None:
     torch.testing.assert_close(sample_regions(frames, grid, moved)[:, 0], frames[:, 3:19, 13:29])
 
 
-def test_bad_input_is_named(session: RecordedSession, regions: RegionVideo, tmp_path) -> None:  # type: ignore[no-untyped-def]
+def test_bad_input_is_named(session: RecordedSession, regions: RegionVideo, tmp_path) -> None:
     video, labels = session.video, session.labels
     outside = replace(labels, regions=dict(labels.regions, mouth=(60.0, 100.0, 130.0, 150.0)))
     with pytest.raises(ValueRangeError, match=r"region 'mouth' is .* inside the image of 128 x 170"):

@@ -30,7 +30,7 @@ def test_points_are_followed_through_the_shake(session: RecordedSession) -> None
     error -= error.mean(0)  # where on the bolt the point was set, with the noise of one frame
     assert error.norm(dim=1).quantile(0.95) < 0.45
     # The markers themselves, where the true markers were.
-    rows = [session.recording.take.markers.names.index(name) for name in SIDE_MARKERS]  # type: ignore[union-attr]
+    rows = [session.recording.take.markers.names.index(name) for name in SIDE_MARKERS]
     centres = session.recording.markers[:, rows].double()
     seen = torch.stack([
         replace(camera, rotation=r, translation=t).project(c)

@@ -100,7 +100,6 @@ def test_takes_match_by_name(hybrid: HybridSolver) -> None:
     solved = hybrid.solve_take(take, predicted, gamma)
     dense = torch.zeros_like(truth)
     dense[:, [7, 1]] = 3.0
-    assert solved.weights is not None
     assert torch.equal(solved.weights.values[..., 0], hybrid(markers, truth, dense))
     with pytest.raises(NameMismatchError, match="found wing"):
         hybrid.solve_take(take, Track(("wing",), predicted.values[:, :1]), Track(("wing",), gamma.values[:, :1]))

@@ -17,7 +17,6 @@ Performance = tuple[BlendshapeRig, Attachment, list[Tensor]]
 
 
 def moved(take: Take, space: Similarity) -> Take:
-    assert take.markers is not None
     return replace(take, markers=Track(take.markers.names, space.apply(take.markers.values)))
 
 
@@ -60,27 +59,22 @@ def test_what_is_left_at_rest_is_told_and_subtracted(performance: Performance) -
     take = record(rig, attachment, takes[0][::5], torch.Generator().manual_seed(0)).take
     generator = torch.Generator().manual_seed(1)
     shift = 3 * torch.randn(100, 3, generator=generator)
-    assert take.markers is not None
     shifted = replace(take, markers=Track(take.markers.names, take.markers.values + shift))
 
     def error(sites: Attachment) -> float:
         solved = MarkerSolver(rig, sites).solve_take(shifted).weights
-        assert solved is not None
         return float((solved.values[..., 0] - takes[0][::5]).abs().mean())
 
     once, often = (rest_residual(rig, attachment, shifted, iterations=count) for count in (1, 4))
-    assert often.residual is not None
     # Most of the shift is seen as such; the part that expressions can imitate is not.
     assert float((often.residual - shift).norm()) < 0.7 * float(shift.norm())
     assert error(often) < error(once) < 0.9 * error(attachment)
     # A take that lies on its sites has nothing to subtract.
     clean = rest_residual(rig, attachment, take).residual
-    assert clean is not None
     assert float(clean.norm(dim=1).mean()) < 0.15
 
 
 def flipped(take: Take, axis: int) -> Take:
-    assert take.markers is not None
     values = take.markers.values.clone()
     values[..., axis] *= -1
     return replace(take, markers=Track(take.markers.names, values))
@@ -105,7 +99,6 @@ def test_a_mirrored_take_is_refused_with_both_distances(
 
 def swapped(take: Take, pair: tuple[int, int], share: float) -> Take:
     """Two labels exchanged in a share of the frames, in the middle of the take."""
-    assert take.markers is not None
     values, frames = take.markers.values.clone(), len(take)
     rows = slice(int(frames * (1 - share) / 2), int(frames * (1 + share) / 2))
     values[rows, list(pair)] = values[rows, list(pair[::-1])]
@@ -155,8 +148,7 @@ def test_no_real_take_is_called_mirrored_and_each_is_when_it_is(
     for weights in takes:
         take = record(rig, sites, weights[::40], torch.Generator().manual_seed(0)).take
         take = moved(take, stage_space)
-        assert take.markers is not None
         right = check_mirrored(take.markers.values.nanmean(0), rest)
         assert not right.mirrored
         assert right.mirrored_distance > 5 * right.distance
-        assert check_mirrored(flipped(take, 0).markers.values.nanmean(0), rest).mirrored  # type: ignore[union-attr]
+        assert check_mirrored(flipped(take, 0).markers.values.nanmean(0), rest).mirrored

@@ -26,7 +26,6 @@ def check_errors(performance: Performance, most: float, take: int, frames: int =
     for missing in (0.0, 0.3):
         flaws = StageFlaws(missing=missing)
         markers = record(rig, attachment, true, torch.Generator().manual_seed(1), flaws).take.markers
-        assert markers is not None
         every = 1 if missing == 0 else 10
         error = (whole(markers.values) - true).abs().mean()
         assert error <= most * (solver(markers.values[::every]) - true[::every]).abs().mean()
@@ -49,7 +48,6 @@ def test_without_release_it_is_the_exact_quadratic_program(
     frames, shapes = 14, 12
     weights = (2 * torch.rand(frames, shapes, generator=generator) - 0.7).clamp(0, 1)
     take = record(small_rig, small_attachment, weights, generator, StageFlaws(noise=1.0)).take
-    assert take.markers is not None
     solver = MarkerSolver(small_rig, small_attachment, ridge=0.01)
     whole = WholeTakeSolver(solver, smoothness=5.0, huber_threshold=float("inf"), sparsity=0.05)
     markers = take.markers.values.double()
@@ -71,7 +69,6 @@ def test_nothing_nearby_has_less_energy_whatever_is_hidden(
     curves = 0.5 + 0.6 * torch.sin(torch.arange(120)[:, None] / 9 + torch.arange(12))
     flaws = StageFlaws(noise=0.5, missing=0.4)
     take = record(small_rig, small_attachment, curves.clamp(0, 1), generator, flaws).take
-    assert take.markers is not None
     markers = take.markers.values.double()
     markers[50:56] = torch.nan  # frames that show nothing are bridged
     whole = WholeTakeSolver(MarkerSolver(small_rig, small_attachment))
@@ -90,7 +87,6 @@ def test_a_blink_keeps_its_height(small_rig: BlendshapeRig, small_attachment: At
     weights = torch.zeros(180, 12)
     weights[:, 3] = 0.9 * blink
     take = record(small_rig, small_attachment, weights, torch.Generator().manual_seed(0)).take
-    assert take.markers is not None
     solver = MarkerSolver(small_rig, small_attachment)
     kept = WholeTakeSolver(solver)(take.markers.values)[:, 3].max()
     flattened = WholeTakeSolver(solver, huber_threshold=float("inf"))(take.markers.values)[:, 3].max()
@@ -101,7 +97,6 @@ def test_a_blink_keeps_its_height(small_rig: BlendshapeRig, small_attachment: At
 def test_the_frame_rate_does_not_matter(small_rig: BlendshapeRig, small_attachment: Attachment) -> None:
     weights = (0.5 + 0.5 * torch.sin(torch.arange(240)[:, None] / 12 + torch.arange(12))).clamp(0, 1)
     take = record(small_rig, small_attachment, weights, torch.Generator().manual_seed(0), StageFlaws(noise=0)).take
-    assert take.markers is not None
     whole = WholeTakeSolver(MarkerSolver(small_rig, small_attachment), smoothness=100.0)
     full, half = whole(take.markers.values, 60.0), whole(take.markers.values[::2], 30.0)
     torch.testing.assert_close(half[5:-5], full[::2][5:-5], rtol=0, atol=0.01)
@@ -112,11 +107,9 @@ def test_takes_by_label_in_another_space_and_bad_input(
 ) -> None:
     weights = torch.full((20, 12), 0.3)
     take = record(small_rig, small_attachment, weights, torch.Generator().manual_seed(0)).take
-    assert take.markers is not None
     whole = WholeTakeSolver(MarkerSolver(small_rig, small_attachment))
     order = list(reversed(take.markers.names))
     solved = whole.solve_take(Take(60.0, markers=take.markers.select(order))).weights
-    assert solved is not None
     here = whole(take.markers.values)
     torch.testing.assert_close(solved.values[..., 0], here, rtol=0, atol=1e-4)
     elsewhere = WholeTakeSolver(MarkerSolver(small_rig, small_attachment, stage_space.inverse()))
@@ -141,7 +134,6 @@ def test_curves_bend_in_seconds_where_frames_were_dropped(performance: Performan
     rig, attachment, takes = performance
     true = takes[0][:240]
     markers = record(rig, attachment, true, torch.Generator().manual_seed(1)).take.markers
-    assert markers is not None
     keep = torch.rand(240, generator=torch.Generator().manual_seed(3)) > 0.2
     keep[100:130] = False
     keep[0] = True

@@ -159,7 +159,7 @@ def test_the_solver_and_all_it_holds(device: str) -> None:
         None,
         K,
         ShapePrior.fit([takes], names),
-        Walk(),  # type: ignore[arg-type]
+        Walk(),
         VideoSettings(relative_noise=0.01),
     )
     landmarks = synthetic_landmarks(solver, 4)[1].double()

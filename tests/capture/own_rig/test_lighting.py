@@ -38,7 +38,6 @@ def rig() -> BlendshapeRig:
 
 def performed(rig: BlendshapeRig, frames: int, generator: torch.Generator) -> Tensor:
     take = perform(frames, generator, fps=20.0)
-    assert take.weights is not None
     return take.weights.values[..., 0] @ mapping(take.weights.names, rig.names).T
 
 

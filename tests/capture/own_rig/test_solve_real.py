@@ -21,9 +21,8 @@ pytestmark = pytest.mark.real
 @pytest.mark.bench
 def test_real_landmarks_move_the_real_rig(data: Path, ict_folder: Path, performances: list[Path]) -> None:
     rig = load_rig(ict_folder, part="face")
-    takes = [rig.weights_from(load_take(path).weights).clamp(0, 1) for path in performances[:3]]  # type: ignore[arg-type]
+    takes = [rig.weights_from(load_take(path).weights).clamp(0, 1) for path in performances[:3]]
     take = load_take(data / "landmarks" / "openface_100_frames.csv")
-    assert take.landmarks is not None
     landmarks, fps = take.landmarks.values, take.fps
     modes = load_identity_modes(ict_folder, part="face").deltas[:12]
     sizes = modes.flatten(1).norm(dim=1)

@@ -112,6 +112,6 @@ def test_states_that_no_rig_gives_are_refused(solver: VideoSolver, tmp_path: Pat
     with pytest.raises(RuntimeError, match="size mismatch"):
         broken.load_state_dict({**solver.state_dict(), "basis": solver.basis[..., :3]})
     unknown = VideoSolver.from_config({**solver.config, "prior": None})
-    unknown.prior = torch.nn.Identity()  # type: ignore[assignment]
+    unknown.prior = torch.nn.Identity()
     with pytest.raises(NameMismatchError, match="prior of class Identity"):
         _ = unknown.config

@@ -150,7 +150,7 @@ def test_derivatives_are_finite_differences(small: BlendshapeRig, remembers: boo
     found = film(small, acted(60)[:2], rotation, translation, noise=1.0)
     prior = ShapePrior.fit([acted(40)], SEEN)
     settings = VideoSettings(relative_noise=0.01, tolerance=1e-11, steps=500)
-    solver = VideoSolver(small, None, K, prior, Walk() if remembers else None, settings)  # type: ignore[arg-type]
+    solver = VideoSolver(small, None, K, prior, Walk() if remembers else None, settings)
     factor = torch.randn(2, len(SEEN), generator=torch.Generator().manual_seed(3), dtype=torch.float64)
 
     def value(landmarks: Tensor) -> Tensor:
@@ -159,7 +159,6 @@ def test_derivatives_are_finite_differences(small: BlendshapeRig, remembers: boo
 
     probe = found.clone().requires_grad_()
     value(probe).backward()
-    assert probe.grad is not None
     way = torch.randn(found.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     step = 1e-5
     difference = (value(found + step * way) - value(found - step * way)) / (2 * step)
@@ -199,7 +198,6 @@ def test_derivatives_with_correctives_are_finite_differences(corrective: Blendsh
     solver = VideoSolver(corrective, None, K, settings=VideoSettings(tolerance=1e-11, steps=500))
     probe = found.clone().requires_grad_()
     solver(probe, rotation, translation).weights.square().sum().backward()
-    assert probe.grad is not None
     way = 1e-5 * torch.randn(found.shape, generator=torch.Generator().manual_seed(4), dtype=torch.float64)
     after, before = (solver(found + step, rotation, translation).weights.square().sum() for step in (way, -way))
     torch.testing.assert_close((probe.grad * way).sum(), (after - before) / 2, rtol=1e-3, atol=1e-9)
@@ -207,7 +205,7 @@ def test_derivatives_with_correctives_are_finite_differences(corrective: Blendsh
 
 def test_frame_by_frame_is_the_batch(small: BlendshapeRig) -> None:
     found = film(small, acted(6), *poses(6), noise=1.0)
-    solver = VideoSolver(small, None, K, dynamics=Walk())  # type: ignore[arg-type]
+    solver = VideoSolver(small, None, K, dynamics=Walk())
     together = solver(found)
     state = solver.start()
     for t, marks in enumerate(found):
@@ -222,7 +220,7 @@ def test_memory_beats_single_frames_and_all_frames_beat_memory(small: Blendshape
     weights = acted(60)
     found = film(small, weights, *poses(60), noise=2.0)
     alone = VideoSolver(small, None, K, settings=VideoSettings(pixel_noise=2.0))
-    solver = VideoSolver(small, None, K, None, Walk(), VideoSettings(pixel_noise=2.0))  # type: ignore[arg-type]
+    solver = VideoSolver(small, None, K, None, Walk(), VideoSettings(pixel_noise=2.0))
     errors = [float((w - weights)[10:].square().mean().sqrt()) for w in (alone(found).weights, solver(found).weights)]
     errors.append(float((solve_whole_take(solver, found).weights - weights)[10:].square().mean().sqrt()))
     assert errors[1] < 0.72 * errors[0]
@@ -235,7 +233,7 @@ def test_frames_without_a_face_are_bridged(small: BlendshapeRig) -> None:
     found[:2] = torch.nan
     found[12:16] = torch.nan
     found[20, 5:] = torch.nan  # five are too few
-    solver = VideoSolver(small, None, K, dynamics=Walk())  # type: ignore[arg-type]
+    solver = VideoSolver(small, None, K, dynamics=Walk())
     for solution in (solver(found), solve_whole_take(solver, found)):
         assert solution.solved.tolist() == [t not in (0, 1, 12, 13, 14, 15, 20) for t in range(30)]
         assert bool(torch.isfinite(solution.weights).all() & torch.isfinite(solution.rotation).all())

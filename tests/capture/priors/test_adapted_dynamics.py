@@ -81,7 +81,6 @@ def learned() -> DynamicsPrior:
     takes, names = [], ()
     for seed in range(2):
         track = perform(500, torch.Generator().manual_seed(seed)).weights
-        assert track is not None
         takes.append(track.values[..., 0])
         names = track.names
     settings = DynamicsSettings(inducing=40, subset=300, iterations=15)
@@ -120,7 +119,6 @@ def test_two_steps_are_one_frame_of_half_the_rate(learned: DynamicsPrior) -> Non
 @pytest.mark.parametrize("fps", [24.0, 30.0, 120.0])
 def test_another_rate_is_predicted_as_surely_as_it_says(learned: DynamicsPrior, fps: float) -> None:
     track = perform(800, torch.Generator().manual_seed(7)).weights
-    assert track is not None
     adapted = adapt_dynamics(learned, track.names, fps)
     windows, following = windows_of(Take(60.0, weights=track).resampled(fps).weights.values[..., 0], adapted.window)
     windows = windows + 0.005 * torch.randn(windows.shape, generator=torch.Generator().manual_seed(2))

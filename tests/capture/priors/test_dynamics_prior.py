@@ -40,7 +40,6 @@ def springs(frames: int = 900, seed: int = 0, kick: float = 0.01) -> Tensor:
 
 def performance(frames: int, seed: int) -> tuple[Tensor, tuple[str, ...]]:
     track = perform(frames, torch.Generator().manual_seed(seed)).weights
-    assert track is not None
     return track.values[..., 0], track.names
 
 
@@ -161,7 +160,6 @@ def test_the_energys_minimum_is_the_mean(prior: DynamicsPrior) -> None:
     windows, _ = windows_of(performance(40, 8)[0], prior.window)
     mean, variance = prior(windows)
     told = prior.energy(windows)
-    assert told.constant is not None
     energy = Quadratic(told.H.double(), told.f.double(), told.constant.double())
     best = torch.linalg.solve(energy.H, -energy.f[..., None])[..., 0]
     torch.testing.assert_close(best.float(), mean, rtol=1e-4, atol=1e-5)
@@ -197,7 +195,6 @@ def test_the_zoo_keeps_it(prior: DynamicsPrior, tmp_path: Path) -> None:
 def test_real_takes_are_predicted_better_than_by_a_line(performances: list[Path]) -> None:
     tracks = [load_take(path).weights for path in performances]
     takes = [track.values[..., 0] for track in tracks if track is not None]
-    assert tracks[0] is not None
     settings = DynamicsSettings(inducing=30, subset=300, iterations=8)
     prior = DynamicsPrior.fit(takes[:4], tracks[0].names, 3, settings=settings)
     windows, following = (torch.cat(parts) for parts in zip(*(windows_of(take, 3) for take in takes[4:]), strict=True))

@@ -60,7 +60,6 @@ class Recorded:
     def recorded(self) -> list[dict]:
         """The answers that the recording holds, found by their weights."""
         take = load_live_link(self.csv)
-        assert take.weights is not None
         first_row = take.weights.values[0, :, 0].numpy()
         first = next(i for i, one in enumerate(self.solved) if np.abs(one["weights"] - first_row).max() < 1e-6)
         return self.solved[first : first + len(take)]

@@ -106,7 +106,6 @@ def test_a_take_is_saved_as_film_and_as_usd_with_its_textures(app: Path, faces: 
         for kind, name in ((".mp4", "take.mp4"), (".usdz", "take.usdz"), ("film", "camera.mp4")):
             (tmp_path / name).write_bytes(blob(page, kind))
     animated = read_gltf_weights(recorded.glb)
-    assert animated is not None
     seconds = animated.times
     with av.open(str(tmp_path / "take.mp4")) as film:
         stream = film.streams.video[0]
@@ -138,6 +137,5 @@ def test_a_take_is_saved_as_film_and_as_usd_with_its_textures(app: Path, faces: 
 
 def extra_bytes(package: zipfile.ZipFile, info: zipfile.ZipInfo) -> int:
     """The size of the extra field before a file's data, which aligns it."""
-    assert package.fp is not None
     package.fp.seek(info.header_offset + 28)
     return int(struct.unpack("<H", package.fp.read(2))[0])

@@ -30,7 +30,6 @@ def test_recorded_weights_are_those_of_onnx_runtime_in_python(app: Path, recorde
     """On the very pixels and intervals that the page gave its worker."""
     assert_same_weights(app.parent / "planted.onnx", recorded, 1e-5)
     rows = load_take(recorded.csv).weights
-    assert rows is not None
     answers = np.array([one["weights"] for one in recorded.recorded])
     np.testing.assert_allclose(rows.values[..., 0], answers, rtol=0, atol=1e-7)
     assert len(answers) > 5
@@ -58,9 +57,6 @@ def test_the_glb_has_the_recording_as_its_animation(character: Path, recorded: R
     take, told = read_gltf_weights(recorded.glb), load_live_link(recorded.csv)
     rig, before = load_rig(recorded.glb), load_rig(character)
     torch.testing.assert_close(rig.deltas, before.deltas)
-    assert take is not None
-    assert take.weights is not None
-    assert told.weights is not None
     assert take.weights.names == rig.names == before.names
     column = {name: i for i, name in enumerate(ARKIT)}
     source = {"mouthSmile_L": "mouthSmileLeft", "mouthSmile_R": "mouthSmileRight", "EyeBlinkLeft": "eyeBlinkLeft"}

@@ -22,7 +22,7 @@ def heights(seed: int) -> Tensor:
     y, x = torch.meshgrid(*[torch.arange(64.0).double() / 64 * 2 * math.pi] * 2, indexing="ij")
     waves = torch.randint(1, 4, (4, 2), generator=generator).double()
     phase = 6 * torch.rand(4, generator=generator).double()
-    return sum(3 * torch.sin(a * x + b * y + p) for (a, b), p in zip(waves, phase, strict=True))  # type: ignore[return-value]
+    return sum(3 * torch.sin(a * x + b * y + p) for (a, b), p in zip(waves, phase, strict=True))
 
 
 def normals_of(height: Tensor) -> Tensor:
@@ -38,7 +38,7 @@ NEUTRAL = normals_of(heights(9))
 
 def test_mixed_normals_are_the_normals_of_mixed_heights() -> None:
     weights = torch.tensor([0.3, 0.9, -0.2]).double()
-    expected = normals_of(sum(float(w) * heights(seed) for seed, w in enumerate(weights)))  # type: ignore[arg-type]
+    expected = normals_of(sum(float(w) * heights(seed) for seed, w in enumerate(weights)))
     torch.testing.assert_close(blend_normal_maps(MAPS, weights), expected)
 
 

@@ -39,8 +39,6 @@ def test_weights_and_rate_come_back(fps: float, tmp_path: Path) -> None:
     weights = torch.rand(700, len(rig.names), 1, generator=torch.Generator().manual_seed(0))
     save_animation(rig, Take(fps, weights=Track(rig.names, weights)), tmp_path / "take.glb")
     found = read_gltf_weights(tmp_path / "take.glb")
-    assert found is not None
-    assert found.weights is not None
     assert found.fps == pytest.approx(fps, rel=1e-6)
     assert found.weights.names == rig.names
     assert torch.equal(found.weights.values, weights)
@@ -51,12 +49,10 @@ def test_uneven_frames_come_back_at_their_times(tmp_path: Path) -> None:
     weights = torch.rand(6, len(rig.names), 1, generator=torch.Generator().manual_seed(0))
     save_animation(rig, Take(30.0, weights=Track(rig.names, weights), seconds=seconds), tmp_path / "take.glb")
     found = read_gltf_weights(tmp_path / "take.glb")
-    assert found is not None
     assert found.fps == pytest.approx(1 / 0.034, rel=1e-3)  # the usual step's
     torch.testing.assert_close(found.seconds, seconds.double(), atol=1e-6, rtol=0)
     save_animation(rig, found, tmp_path / "again.glb")
     again = read_gltf_weights(tmp_path / "again.glb")
-    assert again is not None
     torch.testing.assert_close(again.seconds, found.seconds)
 
 
@@ -167,6 +163,4 @@ def test_a_performance_is_read_before_the_animations_that_the_file_had(tmp_path:
     performance = Performance(np.arange(5) / 30, rig.names, played, np.zeros((5, 9)))
     (tmp_path / "performed.glb").write_bytes(performed_glb(read_document(path), performance))
     found = read_gltf_weights(tmp_path / "performed.glb")
-    assert found is not None
-    assert found.weights is not None
     torch.testing.assert_close(found.weights.values[..., 0], torch.from_numpy(played))

@@ -45,7 +45,6 @@ def test_points_triangles_and_coordinates_are_read(tmp_path: Path) -> None:
     np.testing.assert_allclose(rig.neutral.vertices, SQUARE * 1000, atol=0.05)
     np.testing.assert_allclose(rig.deltas[0], LIFT * 1000, atol=1e-3)
     mesh = load_mesh(path)
-    assert mesh.uvs is not None
     corners = mesh.uvs[mesh.uv_faces]
     np.testing.assert_allclose(corners[1], [[0, 1], [1, 0], [0, 0.75]], atol=1e-3)
 

@@ -148,7 +148,6 @@ def test_wrinkle_maps_are_valid_and_three_shows_the_neutrals(node: str, tmp_path
 
 
 def assert_tangents_are_mikktspaces(node: str, folder: Path, mesh: Mesh) -> None:
-    assert mesh.uvs is not None
     assert mesh.uv_faces is not None
     points, uvs = mesh.vertices.double(), mesh.uvs.double()
     normals = vertex_normals(points, mesh.faces)
@@ -169,7 +168,6 @@ def test_tangents_are_the_ones_that_viewers_compute(node: str, tmp_path: Path) -
         mesh.vertices + torch.randn(mesh.vertices.shape, generator=torch.Generator().manual_seed(0))
     )
     assert_tangents_are_mikktspaces(node, tmp_path, bent)
-    assert mesh.uvs is not None
     assert_tangents_are_mikktspaces(node, tmp_path, replace(bent, uvs=(mesh.uvs - 0.5).abs() + 0.1 * mesh.uvs))
 
 

@@ -57,7 +57,6 @@ def test_maps_come_back_from_a_glb_beside_the_rig(tmp_path: Path) -> None:
     rig, made = sheet_rig(), maps()
     save_rig(rig, tmp_path / "rig.glb", made)
     found = load_region_maps(tmp_path / "rig.glb")
-    assert found is not None
     assert found.regions == REGIONS
     for name in ("normals", "neutral"):
         apart = getattr(found, name) - getattr(made, name)
@@ -69,7 +68,6 @@ def test_maps_come_back_from_a_glb_beside_the_rig(tmp_path: Path) -> None:
     assert again.names == rig.names
     torch.testing.assert_close(again.deltas, rig.deltas, atol=1e-4, rtol=0)
     shown = load_detail_maps(tmp_path / "rig.glb")
-    assert shown is not None
     assert shown.names == ()
     save_rig(rig, tmp_path / "none.glb")
     assert load_region_maps(tmp_path / "none.glb") is None

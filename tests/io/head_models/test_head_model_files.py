@@ -84,7 +84,6 @@ def test_damaged_files_of_eos_are_refused_and_read_no_more_than_they_hold(rig: B
     write_eos(rig, path)
     whole = path.read_bytes()
     model = load_head_model_file(path)
-    assert model.landmarks is not None
     assert torch.equal(model.landmarks.on(model.neutral.vertices), rig.vertices[rig.neutral.landmarks])
     size = len(rig.vertices) * 3
     damaged = {
@@ -107,7 +106,6 @@ def test_flame_is_read_from_safetensors_too(arrays: dict[str, dict[str, Any]], t
     }
     save_file(plain, tmp_path / "flame.safetensors")
     model = load_head_model_file(tmp_path / "flame.safetensors")
-    assert model.joints is not None
     assert model.joints.names == ("root", "neck", "jaw", "left_eye", "right_eye")
     assert model.joints.parents == (-1, 0, 1, 1, 1)
 
@@ -122,7 +120,6 @@ def test_flame_turns_its_jaw_and_eyes_about_their_joints(
     rotations[1, 3, 1] = 0.4
     posed = model.posed(model.neutral.vertices, torch.zeros(2, 51), rotations)
     notes = rig.neutral.annotations
-    assert notes is not None
     chin = rig.neutral.landmarks[8]
     assert float(posed[0, chin, 1] - rig.vertices[chin, 1]) < -15
     ball = notes.regions["eyeball_left"]
@@ -139,14 +136,12 @@ def test_landmarks_are_read_of_the_files_beside(
     np.savez(tmp_path / "gnm_head.npz", **arrays["gnm"])
     gnm_landmarks(rig, tmp_path / "head_sparse_68.txt")
     gnm = load_head_model_file(tmp_path / "gnm_head.npz")
-    assert gnm.landmarks is not None
     assert torch.allclose(gnm.landmarks.on(gnm.neutral.vertices), truth, atol=1e-3)  # its contour in iBUG's order
     beside = ("lmk_face_idx", "lmk_b_coords")
     np.savez(tmp_path / "flame.npz", **{name: v for name, v in arrays["flame"].items() if name not in beside})
     assert load_head_model_file(tmp_path / "flame.npz").landmarks is None
     np.savez(tmp_path / "flame_static_embedding.npz", **{name: arrays["flame"][name] for name in beside})
     flame = load_head_model_file(tmp_path / "flame.npz")
-    assert flame.landmarks is not None
     assert flame.landmarks.rows.tolist() == list(range(17, 68))
     assert torch.allclose(flame.landmarks.on(flame.neutral.vertices), truth[17:], atol=1e-3)
 

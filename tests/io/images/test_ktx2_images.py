@@ -59,7 +59,6 @@ def test_a_character_keeps_its_picture_and_without_the_package_says_so(
 ) -> None:
     path = data / "characters" / "facecap.glb"
     texture = load_mesh(path).texture
-    assert texture is not None
     assert float(texture.std()) > 0.1
     monkeypatch.setitem(sys.modules, "opengl_basisu", None)
     with pytest.warns(UserWarning, match=r"needs opengl-basisu, .* the surface goes without it"):

@@ -21,8 +21,6 @@ def picture(seed: int, height: int, width: int) -> torch.Tensor:
 
 def shown(mesh: Mesh, triangle: int, at: torch.Tensor) -> torch.Tensor:
     assert mesh.texture is not None
-    assert mesh.uvs is not None
-    assert mesh.uv_faces is not None
     return sample_texture(mesh.texture, at @ mesh.uvs[mesh.uv_faces[triangle]])
 
 
@@ -46,7 +44,7 @@ def test_images_of_other_sizes_and_tiles_and_a_plain_colour_are_shown_as_they_we
         one = looks[number]
         own = torch.ones(50, 3) if one.image is None else sample_texture(one.image, at @ uvs)
         assert torch.allclose(shown(both, triangle, at), own * one.color, atol=1e-4)
-    assert torch.equal(with_looks(mesh, torch.zeros(4).long(), looks[:1]).uvs, moved)  # type: ignore[arg-type]
+    assert torch.equal(with_looks(mesh, torch.zeros(4).long(), looks[:1]).uvs, moved)
 
 
 def test_a_strip_longer_than_an_image_may_be_is_made_shorter() -> None:
@@ -55,7 +53,6 @@ def test_a_strip_longer_than_an_image_may_be_is_made_shorter() -> None:
     corners = torch.tensor([[0.0, 0.5], [1.0, 0.5], [0.5, 0.5]])
     mesh = Mesh(torch.eye(3), torch.tensor([[0, 1, 2], [0, 2, 1]]), uvs=corners, uv_faces=torch.tensor([[0, 1, 2]] * 2))
     made = with_looks(mesh, torch.tensor([0, 1]), [Look(strip), Look(None, torch.tensor([1.0, 0.0, 0.0]))])
-    assert made.texture is not None
     assert max(made.texture.shape[1:]) <= 8192
     for share in (0.1, 0.5, 0.9):
         found = shown(made, 0, torch.tensor([[1 - share, share, 0.0]]))[0]
@@ -77,7 +74,7 @@ def test_a_file_of_two_images_and_a_plain_colour_keeps_all_three(tmp_path: Path)
     views = [{"bufferView": build.view(encode_png(image)), "mimeType": "image/png"} for image in images]
     factor = [0.5, 0.1, 0.9]
     materials = [{"pbrMetallicRoughness": {"baseColorTexture": {"index": number}}} for number in range(2)]
-    materials.append({"pbrMetallicRoughness": {"baseColorFactor": [*factor, 1.0]}})  # type: ignore[dict-item]
+    materials.append({"pbrMetallicRoughness": {"baseColorFactor": [*factor, 1.0]}})
     build.root |= {
         "images": views,
         "textures": [{"source": 0}, {"extensions": {"EXT_texture_webp": {"source": 1}}}],

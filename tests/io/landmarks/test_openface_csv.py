@@ -26,7 +26,6 @@ def test_a_real_file_agrees_with_numpy_and_comes_back(data: Path, tmp_path: Path
     table = np.genfromtxt(path, delimiter=",", skip_header=1, dtype=np.float64)
     header = [name.strip() for name in path.read_text().splitlines()[0].split(",")]
     take = load_take(path)
-    assert take.landmarks is not None
     assert take.landmarks.names == tuple(map(str, range(68)))
     x, y = header.index("x_0"), header.index("y_0")
     expected = np.stack([table[:, x : x + 68], table[:, y : y + 68]], -1).astype(np.float32)
@@ -34,9 +33,8 @@ def test_a_real_file_agrees_with_numpy_and_comes_back(data: Path, tmp_path: Path
     np.testing.assert_array_equal(take.extras["columns"]["pose_Tz"].numpy(), table[:, header.index("pose_Tz")])
     save_take(take, tmp_path / "take.csv")
     again = load_take(tmp_path / "take.csv")
-    assert again.landmarks is not None
     assert same(again.landmarks.values, take.landmarks.values)
-    assert same(again.landmarks.confidence, take.landmarks.confidence)  # type: ignore[arg-type]
+    assert same(again.landmarks.confidence, take.landmarks.confidence)
     assert again.fps == take.fps
     assert list(again.extras["columns"]) == list(take.extras["columns"])
     assert all(same(column, take.extras["columns"][name]) for name, column in again.extras["columns"].items())
@@ -45,12 +43,10 @@ def test_a_real_file_agrees_with_numpy_and_comes_back(data: Path, tmp_path: Path
 def test_a_lost_face_is_nan_and_times_to_the_millisecond_tell_the_rate(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text(_GOOD)
     take = load_landmarks_csv(tmp_path / "take.csv")
-    assert take.landmarks is not None
     assert take.fps == 30
     assert take.landmarks.values[0].tolist() == [[10, 20], [11, 21]]
     assert take.landmarks.values.isnan().all((1, 2)).tolist() == [False, False, True, False]
     assert take.extras["columns"]["X_0"].tolist() == [5, 6, 7, 8]
-    assert take.landmarks.confidence is not None
     torch.testing.assert_close(take.landmarks.confidence[:, 1], torch.tensor([0.9, 0.8, 0.1, 0.9]))
 
 
@@ -60,7 +56,6 @@ def test_landmarks_with_gaps_and_any_names_come_back(tmp_path: Path) -> None:
     take = Take(60000 / 1001, landmarks=Track(("nose", "x_y", "Ø"), values))
     save_landmarks_csv(take, tmp_path / "take.csv")
     back = load_landmarks_csv(tmp_path / "take.csv")
-    assert back.landmarks is not None
     assert back.landmarks.names == ("nose", "x_y", "Ø")
     assert same(back.landmarks.values, values)
     assert back.fps == take.fps

@@ -34,14 +34,12 @@ def test_the_layout_is_read_as_documented(tmp_path: Path) -> None:
     nan = torch.nan
     expected = [[[1.5, 2, 3], [4, 5, 6]], [[nan] * 3, [7, 8, 9]], [[1, 2, 3], [nan] * 3]]
     assert take.fps == 50
-    assert take.markers is not None
     assert same(take.markers.values, (torch.tensor(expected).double() * 25.4).float())
 
 
 def test_columns_are_matched_by_name(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text("frame,time,a_z,b_y,a_x,b_x,a_y,b_z\n0,0,3,20,1,10,2,30\n")
     take = load_markers_csv(tmp_path / "take.csv")
-    assert take.markers is not None
     assert take.markers.names == ("a", "b")
     assert take.markers.values.tolist() == [[[1, 2, 3], [10, 20, 30]]]
 
@@ -100,7 +98,6 @@ def test_other_separators_and_capitals_are_markers_too(axes: str, tmp_path: Path
     (tmp_path / "take.csv").write_text("\n".join(",".join(row) for row in [header, *rows]) + "\n")
     take = load_take(tmp_path / "take.csv")
     assert take.weights is None
-    assert take.markers is not None
     assert take.markers.names == tuple(labels)
     torch.testing.assert_close(take.markers.values, values)
 
@@ -114,14 +111,12 @@ def test_markers_without_one_axis_are_refused_and_no_weights(tmp_path: Path) -> 
 def test_shapes_that_end_in_an_axis_are_weights(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text("frame,time,lookX,lookY,jaw\n0,0,0.5,0.5,0.1\n1,0.1,0.5,0.5,0.1\n")
     take = load_take(tmp_path / "take.csv")
-    assert take.weights is not None
     assert take.weights.names == ("lookX", "lookY", "jaw")
 
 
 def test_micrometres_are_read_where_they_are_asked_for(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text("frame,time,a_x,a_y,a_z\n0,0,1000,2500,-500\n")
     take = load_take(tmp_path / "take.csv", unit="um")
-    assert take.markers is not None
     assert take.markers.values.flatten().tolist() == [1, 2.5, -0.5]
     assert take.extras["unit"] == "um"
 
@@ -130,14 +125,12 @@ def test_the_origin_stands_for_not_seen(tmp_path: Path) -> None:
     table = tmp_path / "take.csv"
     table.write_text("frame,time,a_x,a_y,a_z,b_x,b_y,b_z\n0,0,0,0,0,0,5,0\n1,0.02,0,-0,0.0,1,2,3\n2,0.04,1,0,0,1,2,3\n")
     markers = load_markers_csv(table).markers
-    assert markers is not None
     assert torch.isnan(markers.values).any(2).tolist() == [[True, False], [True, False], [False, False]]
     # The other formats end in the same function.
     for name, save, load in (("take.c3d", save_c3d, load_c3d), ("take.trc", save_trc, load_trc)):
         values = torch.tensor([[[0.0, 0, 0], [0, 5, 0]], [[1, 0, 0], [0, 0, 0]]])
         save(Take(60.0, markers=Track(("a", "b"), values)), tmp_path / name)
         found = load(tmp_path / name).markers
-        assert found is not None
         assert torch.isnan(found.values).any(2).tolist() == [[True, False], [False, True]]
         save(Take(60.0, markers=Track(("a", "b"), torch.zeros(2, 2, 3))), tmp_path / name)
         with pytest.raises(FileFormatError, match=r"none of them seen .* other than \(0, 0, 0\)"):

@@ -34,14 +34,12 @@ def test_a_take_comes_back_to_the_bit(take: Take) -> None:
 def test_a_file_as_opensim_writes_it_is_read(line_end: str, tmp_path: Path) -> None:
     (tmp_path / "take.trc").write_bytes(_OPENSIM.replace("\n", line_end).encode())
     take = load_trc(tmp_path / "take.trc")
-    assert take.markers is not None
     assert take.markers.names == ("nose", "chin")
     assert take.fps == 59.94
     nan = torch.nan
     expected = [[[15, -20, 300], [40, 50, 60]], [[10, 20, 30], [nan] * 3], [[nan] * 3, [70, 80, 90]]]
     assert same(take.markers.values, torch.tensor(expected))
     metres = load_trc(tmp_path / "take.trc", unit="m")
-    assert metres.markers is not None
     assert metres.markers.values[0, 1].tolist() == [4000, 5000, 6000]
 
 

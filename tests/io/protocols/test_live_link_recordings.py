@@ -21,7 +21,6 @@ from torchface.shape_names import ARKIT
 def test_lost_and_late_packets_leave_gaps_in_order(tmp_path: Path) -> None:
     weights, rotations = some_frames()
     take = load_take(gesichter(tmp_path / "take.gesichter", weights, rotations, [7, 8, 12, 10, 13]))
-    assert take.weights is not None
     order = [0, 1, 3, 2, 4]
     torch.testing.assert_close(take.weights.values[..., 0], weights[order])
     assert (take.times * 60).round().int().tolist() == [0, 1, 3, 5, 6]
@@ -39,7 +38,6 @@ def test_an_iphones_packets_are_what_they_are_byte_by_byte(data: Path) -> None:
             at += 4 + size
         values = torch.tensor(expected)
         take = load_take(path)
-        assert take.weights is not None
         assert (take.fps, take.weights.names) == (60.0, ARKIT)
         torch.testing.assert_close(take.weights.values[..., 0], values[:, :52], rtol=0, atol=0)
         turned = torch.stack([take.extras["columns"][name] for name in ROTATIONS], 1).float()
@@ -51,7 +49,6 @@ def test_an_iphones_packets_are_what_they_are_byte_by_byte(data: Path) -> None:
 @pytest.mark.parametrize(("file", "moved"), [("jawopen", "jawOpen"), ("headyaw", "HeadYaw")])
 def test_each_debug_file_moves_the_shape_that_it_is_named_after(file: str, moved: str, data: Path) -> None:
     take = load_take(data / "protocols" / f"live_link_debug-{file}.gesichter")
-    assert take.weights is not None
     channels = dict(zip(ARKIT, take.weights.values[..., 0].T, strict=True)) | take.extras["columns"]
     assert [name for name, values in channels.items() if float(values.abs().max()) > 0] == [moved]
     assert float(channels[moved].abs().max()) == pytest.approx(1.0, abs=0.05)
@@ -60,7 +57,6 @@ def test_each_debug_file_moves_the_shape_that_it_is_named_after(file: str, moved
 @pytest.mark.real
 def test_the_file_of_all_shapes_moves_one_after_the_other_in_live_links_order(data: Path) -> None:
     take = load_take(data / "protocols" / "live_link_debug-all-blendshapes.gesichter")
-    assert take.weights is not None
     values = torch.cat(
         [take.weights.values[..., 0], *(take.extras["columns"][n].float()[:, None] for n in ROTATIONS)], 1
     )

@@ -106,7 +106,7 @@ def test_the_user_allows_once_and_frames_arrive(tmp_path: Path) -> None:
             closing(open_sender(f"vts://127.0.0.1:{port}?token={token}", ARKIT, 60.0)) as sender,
         ):
             studio.injected.clear()
-            until(lambda s=sender: s.send(weights, torch.tensor([0.1, 0.2, 0.3] + [0.0] * 6)))  # type: ignore[misc]
+            until(lambda s=sender: s.send(weights, torch.tensor([0.1, 0.2, 0.3] + [0.0] * 6)))
             until(lambda: bool(studio.injected))
     assert studio.asked == 1  # the token was kept
     assert token.read_text() == TOKEN
@@ -167,7 +167,7 @@ def test_answers_that_are_none_end_in_words(answer: str, tmp_path: Path) -> None
             socket.send(answer)
 
     studio = Studio()
-    studio.handle = handle  # type: ignore[method-assign]
+    studio.handle = handle
     with running(studio) as port, opened(port, tmp_path / "token") as sender:
         until(lambda: sender.problem.startswith(("not connected (", "found a token of 0 letters")))
         assert not sender.send(torch.zeros(52))

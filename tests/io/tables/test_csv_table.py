@@ -18,7 +18,6 @@ def test_names_that_are_formulas_come_back_and_none_is_run(tmp_path: Path) -> No
     weights = torch.rand(3, len(NAMES), 1, generator=torch.Generator().manual_seed(0))
     save_take(Take(30.0, weights=Track(NAMES, weights)), tmp_path / "take.csv")
     found = load_take(tmp_path / "take.csv").weights
-    assert found is not None
     assert found.names == NAMES
     assert found.values.equal(weights)
     with (tmp_path / "take.csv").open(newline="") as file:
@@ -45,5 +44,4 @@ def test_markers_named_so_come_back(name: str, tmp_path: Path) -> None:
     take = Take(60.0, markers=Track((name,), torch.rand(2, 1, 3)))
     save_take(take, tmp_path / "take.csv")
     found = load_take(tmp_path / "take.csv").markers
-    assert found is not None
     assert found.names == (name,)

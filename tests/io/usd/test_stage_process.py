@@ -280,7 +280,6 @@ WAITS = "import os; os.read(os.pipe()[0], 1)"
 def test_the_process_ends_with_the_one_that_started_it() -> None:
     starts = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {CHILD.format(100) + WAITS!r}])"
     parent = subprocess.Popen([sys.executable, "-c", starts], stdout=subprocess.PIPE)
-    assert parent.stdout is not None
     assert parent.stdout.readline() == b"ready\n"
     parent.kill()
     assert parent.stdout.read() == b""  # ends when no process holds the other end

@@ -205,7 +205,6 @@ rel material:binding = </gums>
     gums = material("gums", "skin.png").replace(".connect = </gums/texture.outputs:rgb>", " = (1, 0, 0)")
     body = painted("face", "skin") + mouth + material("skin", "skin.png") + material("teeth", "teeth.png") + gums
     mesh = load_mesh(usda(tmp_path / "three.usda", body))
-    assert mesh.texture is not None
     middle = mesh.uvs[mesh.uv_faces].mean(1)
     size = torch.tensor([mesh.texture.shape[2], mesh.texture.shape[1]])
     at = (torch.stack([middle[:, 0], 1 - middle[:, 1]], 1) * size).long()

@@ -163,7 +163,7 @@ def test_a_video_cut_off_without_a_word_does_not_replace_the_one_before(
         os.truncate(file, int(kept * Path(file).stat().st_size))
 
     def on_a_full_disk(file: str, mode: str, format: str, **options: object) -> object:
-        return cut_off(file, format) if mode == "w" else opened(file, mode, format, **options)  # type: ignore[call-overload]
+        return cut_off(file, format) if mode == "w" else opened(file, mode, format, **options)
 
     with monkeypatch.context() as patch:
         patch.setattr(av, "open", on_a_full_disk)

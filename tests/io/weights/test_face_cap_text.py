@@ -17,7 +17,6 @@ from torchface.shape_names import ARKIT
 def test_a_recording_keeps_weights_rotations_and_times(tmp_path: Path) -> None:
     weights, rotations = some_frames(40)
     take = load_take(face_cap(tmp_path / "take.txt", weights, rotations))
-    assert take.weights is not None
     assert take.weights.names == ("eyeBlink_L", *ARKIT[1:])  # as the file spells them
     torch.testing.assert_close(take.weights.values[..., 0], weights)
     found = torch.stack([take.extras["columns"][name] for name in ROTATIONS], 1)

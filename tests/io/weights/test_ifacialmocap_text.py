@@ -17,7 +17,6 @@ from torchface.shape_names import ARKIT
 def test_a_recording_keeps_weights_and_rotations(tmp_path: Path) -> None:
     weights, rotations = some_frames()
     take = load_take(ifacialmocap(tmp_path / "take.txt", weights, rotations))
-    assert take.weights is not None
     assert take.weights.names == ARKIT
     assert take.fps == 60
     torch.testing.assert_close(take.weights.values[..., 0], weights)

@@ -19,7 +19,6 @@ def test_audio2faces_shapes_and_those_of_the_tongue_come_by_name(tmp_path: Path)
     weights, _ = some_frames()
     tongue = torch.rand(5, 16, generator=torch.Generator().manual_seed(1))
     take = load_take(audio2face(tmp_path / "take.json", weights, tongue))
-    assert take.weights is not None
     assert take.fps == 30
     assert take.weights.names[52:] == tuple(name[0].upper() + name[1:] for name in TONGUE)
     torch.testing.assert_close(take.weights.values[:, 52:, 0], tongue)
@@ -29,7 +28,6 @@ def test_audio2faces_shapes_and_those_of_the_tongue_come_by_name(tmp_path: Path)
 def test_face_anchors_keep_weights_rotations_and_times(tmp_path: Path) -> None:
     weights, rotations = some_frames()
     take = load_take(face_anchors(tmp_path / "take.json", weights, rotations))
-    assert take.weights is not None
     torch.testing.assert_close(take.weights.values[..., 0], weights)
     found = torch.stack([take.extras["columns"][name] for name in ROTATIONS], 1)
     torch.testing.assert_close(found.float(), rotations, atol=1e-5, rtol=0)

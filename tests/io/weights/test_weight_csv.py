@@ -19,7 +19,6 @@ _GOOD = "frame,time,jawOpen,smile_L\n10,1.0,0.25,\n11,1.1,1,-0.5\n13,1.3,0,1e-3\
 @given(weight_takes())
 @settings(max_examples=25)
 def test_a_take_comes_back_to_the_bit(take: Take) -> None:
-    assert take.weights is not None
     header = ("frame", "time", *take.weights.names)
     assume(len(set(header)) == len(header) and not is_marker_header(header))
     assert round_trip(save_weights_csv, load_weights_csv, take).fps == take.fps
@@ -28,7 +27,6 @@ def test_a_take_comes_back_to_the_bit(take: Take) -> None:
 def test_numbers_rate_and_gaps_are_read(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text(_GOOD)
     take = load_weights_csv(tmp_path / "take.csv")
-    assert take.weights is not None
     expected = torch.tensor([[0.25, torch.nan], [1, -0.5], [0, 1e-3]])[..., None]
     assert same(take.weights.values, expected)
     assert take.fps == 10

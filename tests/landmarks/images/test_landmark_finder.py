@@ -151,7 +151,6 @@ def test_a_resumed_tracker_does_as_one_that_went_on(face: Tensor) -> None:
         kept = one.step(frame)
         if t == 4:
             memory = other.memory
-            assert last is not None
             other = LandmarkTracker(high, detector=stage.detect)
             other.resume(memory)
         last = other.step(frame)

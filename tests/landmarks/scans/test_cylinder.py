@@ -77,7 +77,6 @@ def test_the_pose_is_applied_and_undone() -> None:
 
 def test_colours_follow_the_surface() -> None:
     head = unwrap(ball(100.0), still(), SMALL)
-    assert head.texture is not None
     place = SMALL.points(SMALL.grid(), head.radius.double())[head.mask] / 100 / 2 + 0.5
     assert (head.texture[:, head.mask].T.double() - place).abs().max() < 0.02
 

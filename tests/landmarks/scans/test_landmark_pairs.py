@@ -7,7 +7,6 @@ from torchface.synthetic import neutral_head
 
 def test_lines_run_along_the_outermost_edges_that_touch() -> None:
     template = neutral_head(texture=False)
-    assert template.annotations is not None
     features = template_features(template)
     lids = template.annotations.regions["lids_left"] | template.annotations.regions["lids_right"]
     assert set(features.lines) == set(LINES)

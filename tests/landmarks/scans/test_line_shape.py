@@ -56,7 +56,6 @@ def test_loose_corners_are_made_up_for() -> None:
 
 def test_the_look_has_mean_0_and_norm_1() -> None:
     shape = learned()
-    assert shape.profile is not None
     assert shape.profile.shape == (STATIONS, 2 * REACH + 1)
     assert shape.profile.mean(1).abs().max() < 1e-6
     assert torch.allclose(shape.profile.norm(dim=1), torch.ones(STATIONS, dtype=shape.profile.dtype))

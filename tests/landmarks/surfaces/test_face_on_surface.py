@@ -143,7 +143,6 @@ def test_a_doubtful_face_is_not_taken_beside_a_surer_one_whose_form_is_no_heads(
 def test_a_head_with_holes_for_eyes_is_found_without_doubt(search: FaceSearch) -> None:
     """Points of the eyes were seen on the back of the head, through its eyes, and made the face doubtful: 0.28."""
     head = neutral_head(draw_identities(1, torch.Generator().manual_seed(3))[0], texture=False)
-    assert head.annotations is not None
     regions = head.annotations.regions
     hollow = torch.stack([regions[name] for name in ("eyeball_left", "eyeball_right", "eye_sockets")]).any(0)
     faces = head.faces[~hollow[head.faces].any(1)]

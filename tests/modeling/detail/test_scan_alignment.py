@@ -42,7 +42,6 @@ class Planted:
         """Where wrinkles turn the skin by more than 8 degrees: how far the map's normals are from the true ones, and
         how far the smooth skin's are, degrees."""
         mesh = self.raised
-        assert mesh.uvs is not None
         assert mesh.uv_faces is not None
         texels = rasterise_uvs(mesh.uvs, mesh.uv_faces, *baked.hit.shape)
         hit = baked.hit.flatten()[texels.texels].nonzero()[::3, 0]

@@ -315,7 +315,6 @@ def test_errors_that_go_together_are_whitened(rig: BlendshapeRig, model: HeadMod
     found[0, 3] = torch.nan
     surface = SurfacePoints(found[:, 68:], torch.ones(1, 13), sites)
     problem = Problem(points, 15, found, torch.ones(1), FitSettings(surface=surface, deviations=torch.ones(1, 68)))
-    assert problem.mixing is not None
     inverse = torch.linalg.inv(problem.mixing[0])
     alike = inverse @ inverse.T  # the 17th landmark twice, and once a landmark that is missing
     assert torch.isclose(alike[17, 68], torch.tensor(0.5).double())
@@ -338,7 +337,6 @@ def test_their_variance_is_that_of_a_process_made_symmetric() -> None:
 
 def test_both_sides_move_alike() -> None:
     head = neutral_head(texture=False)
-    assert head.annotations is not None
     twin = head.annotations.mirror
     assert twin is not None
     modes = smooth_differences(head.vertices, head.landmarks, 1.0)

@@ -53,7 +53,6 @@ def test_covariance_is_that_of_planted_errors() -> None:
         wrong = torch.linalg.solve_triangular(torch.linalg.cholesky(H).T, along[:, None], upper=True)[:, 0]
         error = torch.randn(1, points.count, 2, generator=generator).double() + at.by_coefficients @ wrong
         mixing = white.mixing
-        assert mixing is not None
         pixels = torch.linalg.solve(white.factors, torch.linalg.solve(mixing, error)[..., None])[..., 0]
         problem = Problem(points, modes, exact + pixels, problem.focal, replace(settings, surface=surface))
         found = image_solve.solve(problem, State(torch.zeros(modes).double(), views, rows, NOISE))

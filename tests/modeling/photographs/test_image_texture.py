@@ -32,15 +32,11 @@ def bare() -> Mesh:
 @pytest.mark.parametrize("planted", [BLUE, BROWN], ids=["blue", "brown"])
 def test_irises_come_back_from_a_picture(bare: Mesh, planted: Tensor) -> None:
     worn = with_part_colors(bare, planted)
-    assert bare.annotations is not None
-    assert worn.colors is not None
-    assert bare.colors is not None
     skin = ~part_vertices(bare)
     assert torch.equal(worn.colors[skin], bare.colors[skin])
     eyes = bare.vertices[bare.landmarks[36:48]].mean(0)
     camera = look_at(eyes, 10.0, span=160.0, width=640, height=400)
     found = iris_color(bare, [render(worn, camera, lighting=EVEN, samples=1)], [camera])
-    assert found is not None
     assert float((found - planted).norm()) < 0.12
     fronts, wide = [], bare.colors.clone()  # irises of people's size; those of the coarse ball fade from their middle
     for side in ("right", "left"):
@@ -50,19 +46,16 @@ def test_irises_come_back_from_a_picture(bare: Mesh, planted: Tensor) -> None:
         wide[ball] = torch.where((out[:, 2] > 0.8 * out[:, 2].max())[:, None], planted, torch.tensor(1.0))
     picture = render(replace(bare, colors=wide), camera, lighting=EVEN, samples=1)
     ringed = iris_color(bare, [picture], [camera], camera.project(torch.stack(fronts))[None])
-    assert ringed is not None
     assert float((ringed - planted).norm()) < 0.05
     centres = camera.project(torch.stack(fronts)).expand(3, 2, 2)
     sepia = (picture.mean(0) * torch.tensor([1.0, 0.75, 0.4])[:, None, None]).clamp(max=1)
     three = iris_color([bare] * 3, [picture, sepia, picture], [camera] * 3, centres)
-    assert three is not None
     assert torch.equal(three, ringed)  # one in sepia does not decide
     far = look_at(eyes, 10.0, span=2000.0, width=320, height=200)
     assert iris_color(bare, [render(worn, far, lighting=EVEN, samples=1)], [far]) is None
 
 
 def test_a_written_eyeball_wears_the_iris(bare: Mesh) -> None:
-    assert bare.annotations is not None
     ball = bare.annotations.regions["eyeball_left"]
     triangles = ball[bare.faces].all(1).nonzero()[:, 0]
 
@@ -94,7 +87,6 @@ def test_teeth_are_darker_the_further_back_they_lie() -> None:
     teeth = torch.arange(len(head.vertices)) % 3 == 0
     head = replace(head, annotations=replace(head.annotations, regions={"teeth_upper": teeth}))
     colored = with_part_colors(replace(head, colors=torch.ones(len(head.vertices), 3)), None)
-    assert colored.colors is not None
     depth, light = head.vertices[teeth, 2], colored.colors[teeth].mean(1)
     order = depth.argsort(descending=True)
     assert bool((light[order].diff() < 1e-6).all())

@@ -50,7 +50,6 @@ def test_light_from_the_side_is_divided_out(head: Mesh, camera: Camera) -> None:
     normals = vertex_normals(head.vertices.double(), head.faces)
     cheeks = FacePlaces.of(head).cheeks
     light = skin_light(shown, normals, camera, cheeks)
-    assert light is not None
     seen = cheeks & (shown.cosine > 0.4)
     even = unlit(shown.colors, normals, camera, light)
 
@@ -66,7 +65,6 @@ def test_light_from_the_side_is_divided_out(head: Mesh, camera: Camera) -> None:
 def test_hair_is_a_cap_of_its_colour_and_a_bald_head_stays_bald(head: Mesh, camera: Camera) -> None:
     places = FacePlaces.of(head)
     high = places.place[:, 1] > 0.55
-    assert head.colors is not None
     haired = replace(head, colors=torch.where(high[:, None], HAIR, head.colors))
     found = {}
     for name, mesh in (("bald", head), ("hair", haired)):
@@ -75,8 +73,6 @@ def test_hair_is_a_cap_of_its_colour_and_a_bald_head_stays_bald(head: Mesh, came
         found[name] = photographed_skin([head], None, [picture], [camera], FitSettings(texture_size=128, parts=[parts]))
     assert found["bald"].hair is None
     color, cap = found["hair"].hair, found["hair"].colors
-    assert color is not None
-    assert cap is not None
     assert float((color - HAIR).norm()) < 0.06
     behind = (places.behind > 0.8) & (places.place[:, 1] > 0.2)
     assert float((cap[behind] - HAIR).norm(dim=1).median()) < 0.1  # no picture shows it
@@ -86,7 +82,6 @@ def test_hair_is_a_cap_of_its_colour_and_a_bald_head_stays_bald(head: Mesh, came
 
 def test_shadow_beside_hair_is_not_painted_and_a_mole_is(head: Mesh, camera: Camera) -> None:
     places = FacePlaces.of(head)
-    assert head.colors is not None
     border = (places.out > 0.8) & (places.out < 1.0) & (places.place[:, 1] < 0) & (places.place[:, 0] > 0)
     mole = places.cheeks & ((places.place - places.place.new_tensor([-0.4, -0.5, 0.0]))[:, :2].norm(dim=1) < 0.08)
     dark = SKIN * 0.5
@@ -95,7 +90,6 @@ def test_shadow_beside_hair_is_not_painted_and_a_mole_is(head: Mesh, camera: Cam
     )
     parts = planted_parts(picture, {"background": torch.zeros(3)}, 0.05)
     found = photographed_skin([head], None, [picture], [camera], FitSettings(texture_size=128, parts=[parts])).colors
-    assert found is not None
     seen = PosedSurface.each(head, 1)[0].shown_in(picture, camera).cosine > 0.3
     assert float((found[border & seen] - SKIN).norm(dim=1).median()) < 0.1
     assert float((found[mole] - dark).norm(dim=1).min()) < 0.1
@@ -103,7 +97,6 @@ def test_shadow_beside_hair_is_not_painted_and_a_mole_is(head: Mesh, camera: Cam
 
 def test_a_photographs_brows_are_the_only_ones(head: Mesh, camera: Camera) -> None:
     places = FacePlaces.of(head)
-    assert head.colors is not None
     fringe = places.place[:, 1] > places.brows + 0.12
     template = replace(head, colors=torch.where(places.brow[:, None], HAIR, head.colors))
     shown = replace(head, colors=torch.where(fringe[:, None], HAIR, head.colors))  # the person's brows are fair
@@ -111,13 +104,11 @@ def test_a_photographs_brows_are_the_only_ones(head: Mesh, camera: Camera) -> No
     parts = planted_parts(picture, {"hair": HAIR, "background": torch.zeros(3)}, 0.05)
     settings = FitSettings(texture_size=128, parts=[parts], paint_hair=False)
     found = photographed_skin([template], None, [picture], [camera], settings).colors
-    assert found is not None
     assert float((found[places.brow & ~fringe] - SKIN).norm(dim=1).mean()) < 0.1
 
 
 def test_a_hard_shadow_on_the_face_is_taken_away_and_a_mole_is_not(head: Mesh, camera: Camera) -> None:
     places = FacePlaces.of(head)
-    assert head.colors is not None
     shade = torch.where(places.place[:, :1] > 0.1, torch.tensor([0.75, 0.6, 0.4]), torch.tensor([1.0, 1.0, 1.0]))
     plain = render(head, camera, lighting=EVEN, samples=1)
     cheeks = places.cheeks & (PosedSurface.each(head, 1)[0].shown_in(plain, camera).cosine > 0.5)
@@ -129,7 +120,6 @@ def test_a_hard_shadow_on_the_face_is_taken_away_and_a_mole_is_not(head: Mesh, c
     picture = render(shown, camera, lighting=EVEN, samples=1)
     parts = planted_parts(picture, {"background": torch.zeros(3)}, 0.05)
     found = photographed_skin([head], None, [picture], [camera], FitSettings(texture_size=128, parts=[parts])).colors
-    assert found is not None
     spread = (found[cheeks].log().std(0) / (spots * shade)[cheeks].log().std(0)).max()
     assert float(spread) < 0.5
     assert float(found[mole].mean() / found[cheeks].median(0).values.mean()) < 0.85
@@ -138,7 +128,6 @@ def test_a_hard_shadow_on_the_face_is_taken_away_and_a_mole_is_not(head: Mesh, c
 def test_even_skin_stays_as_it_is(head: Mesh) -> None:
     graph = VertexGraph(head.faces, len(head.vertices))
     cheeks = FacePlaces.of(head).cheeks.double()
-    assert head.colors is not None
     blush = head.colors * (1 + 0.04 * torch.sin(head.vertices[:, :1] / 20))
     assert float(patch_offset(blush, cheeks, None, graph)[cheeks > 0].abs().max()) < 0.03
     darker = 0.3 * head.colors  # one complexion may be darker than another all over
@@ -147,7 +136,6 @@ def test_even_skin_stays_as_it_is(head: Mesh) -> None:
 
 def test_hue_of_a_coloured_light_beyond_peoples_skins_is_found(head: Mesh) -> None:
     cheeks = FacePlaces.of(head).cheeks.double()
-    assert head.colors is not None
     white = torch.ones(3, dtype=torch.float64)
     assert torch.equal(light_hue(head.colors * torch.tensor([1.05, 1.0, 0.95]), cheeks, head.colors), white)
     assert torch.equal(light_hue(head.colors * 0.4, cheeks, head.colors), white)
@@ -180,8 +168,6 @@ def test_a_dark_complexion_stays_dark_before_a_dark_wall() -> None:
 
 def test_blush_on_both_cheeks_stays_and_light_on_one_goes(head: Mesh) -> None:
     graph, places = VertexGraph(head.faces, len(head.vertices)), FacePlaces.of(head)
-    assert head.colors is not None
-    assert head.annotations is not None
     skin, mirror = places.cheeks.double(), head.annotations.mirror
     left = (places.place - places.place.new_tensor([0.5, -0.5, 0.0]))[:, :2].norm(dim=1) < 0.25
     assert mirror is not None
@@ -197,13 +183,11 @@ def test_blush_on_both_cheeks_stays_and_light_on_one_goes(head: Mesh) -> None:
 
 def test_an_upper_lid_that_paint_darkens_in_spots_is_skin_when_it_shuts(head: Mesh, camera: Camera) -> None:
     places = FacePlaces.of(head)
-    assert head.colors is not None
     lid = places.lids > 0.5
     spots = lid & (torch.arange(len(lid)) % 2 == 0)
     picture = render(replace(head, colors=torch.where(spots[:, None], 0.2 * SKIN, head.colors)), camera, lighting=EVEN)
     parts = planted_parts(picture, {"background": torch.zeros(3)}, 0.05)
     found = photographed_skin([head], None, [picture], [camera], FitSettings(texture_size=128, parts=[parts])).colors
-    assert found is not None
     assert int(spots.sum()) > 5
     assert float(found[spots].mean() / SKIN.mean()) > 0.75
 

@@ -56,7 +56,6 @@ def lit(subject: Mesh, cameras: list[Camera]) -> list[Tensor]:
 
 
 def difference(found: Tensor, true: Tensor, mesh: Mesh) -> float:
-    assert mesh.annotations is not None
     return float((found - true)[mesh.annotations.regions["face"]].norm(dim=-1).mean())
 
 
@@ -110,7 +109,6 @@ def test_photographs_look_as_the_head_did(subject: Mesh, texture: PhotoTexture, 
 
 
 def test_no_seam_shows_where_photographs_meet(subject: Mesh, skins: Tensor, texture: PhotoTexture) -> None:
-    assert subject.annotations is not None
     inside = subject.annotations.regions["face"][subject.faces].all(1)
     pairs = subject.faces[inside][:, :2]
     jump = (texture.colors[pairs[:, 0]] - texture.colors[pairs[:, 1]]).norm(dim=-1)
@@ -122,7 +120,6 @@ def test_no_seam_shows_where_photographs_meet(subject: Mesh, skins: Tensor, text
 
 def test_the_hidden_side_mirrors_the_seen_one(subject: Mesh, cameras: list[Camera], lit: list[Tensor]) -> None:
     found = photo_texture(subject, lit[:1], cameras[:1], 256)
-    assert subject.annotations is not None
     mirror, face = subject.annotations.mirror, subject.annotations.regions["face"]
     assert mirror is not None
     hidden = face & (found.seen == 0) & (found.seen[mirror] == 1)
@@ -160,7 +157,6 @@ def test_bad_input_is_named(
 
 def test_hair_and_cloth_are_not_painted_on(subject: Mesh, skins: Tensor, cameras: list[Camera]) -> None:
     """Dressed in a blue collar and black hair, the head wears skin there; its face stays as it was photographed."""
-    assert subject.annotations is not None
     regions = subject.annotations.regions
     hair, collar, cheeks = regions["cranium"], regions["neck"] & ~regions["face"], regions["cheek_left"]
     blue, black = torch.tensor([0.1, 0.2, 0.7]), torch.tensor([0.08, 0.06, 0.05])

@@ -235,7 +235,6 @@ def test_teeth_eyes_and_lashes_of_a_random_head_keep_their_offset_to_the_face(
     assert int(part.max()) == 55
     # Shells of the eye give way to closing lids, see test_parts.py.
     notes = real_rig.neutral.annotations
-    assert notes is not None
     shells = torch.stack([mask for name, mask in notes.regions.items() if name.startswith(SHELLS)]).any(0)
     face, other = (part == 0).nonzero()[:, 0], ((part != 0) & ~shells).nonzero()[:, 0]
     nearest = face[torch.cdist(real_rig.vertices[other], real_rig.vertices[face]).argmin(1)]
@@ -266,8 +265,6 @@ def corrective_rig() -> BlendshapeRig:
 def test_transferred_to_itself_a_rig_keeps_its_correctives(corrective_rig: BlendshapeRig) -> None:
     rig = corrective_rig
     found = transfer_deformation(rig, rig.neutral).correctives
-    assert found is not None
-    assert rig.correctives is not None
     assert found.definitions == rig.correctives.definitions
     assert (found.deltas - rig.correctives.deltas).abs().max() < 1e-6
 
@@ -277,16 +274,12 @@ def test_correctives_turn_and_grow_with_the_face(corrective_rig: BlendshapeRig) 
     turn = rotation()
     target = rig.neutral.with_vertices(1.3 * rig.vertices @ turn.T + 7)
     found = transfer_deformation(rig, target).correctives
-    assert found is not None
-    assert rig.correctives is not None
     assert (found.deltas - 1.3 * rig.correctives.deltas @ turn.T).abs().max() < 1e-6
 
 
 def test_on_another_face_correctives_stay_where_they_were(corrective_rig: BlendshapeRig) -> None:
     rig = corrective_rig
     found = transfer_deformation(rig, other_face(rig)).correctives
-    assert found is not None
-    assert rig.correctives is not None
     still = rig.correctives.deltas.norm(dim=-1) < 0.01
     assert found.deltas[still].norm(dim=-1).max() < 0.02
     assert found.deltas[3].abs().max() == 0.0
@@ -331,8 +324,6 @@ def test_lids_of_other_performers_close_where_their_own_do(
 ) -> None:
     blink = template.select(["eyeBlinkLeft", "eyeBlinkRight"])
     annotations = template.neutral.annotations
-    assert annotations is not None
-    assert annotations.contacts is not None
     first, second = annotations.contacts.T
     pose = template.vertices + blink.deltas.sum(0)
     meet = (pose[first] - pose[second]).norm(dim=-1) < 0.1

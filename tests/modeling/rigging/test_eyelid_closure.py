@@ -43,7 +43,6 @@ def test_half_a_blink_is_made_whole(actor: BlendshapeRig, eyes: bool) -> None:
     whole = shut_blinks(head, shut, actor.names, openings)[0]
     assert float((whole - shut).abs().max()) < 1.0  # nothing is left to do
     for row, opening in enumerate(openings):
-        assert opening is not None
         corners, seen = marks[36 + 6 * row : 42 + 6 * row, 0], opening.upper[:, 0]
         assert corners.min() - 1 < seen.min() < seen.max() < corners.max() + 1
         assert float(seen.max() - seen.min()) > 0.7 * float(corners.max() - corners.min())
@@ -78,7 +77,6 @@ def test_lids_of_other_shapes_follow_as_far_as_the_template_s() -> None:
     openings, shares = eyes_seen(head, marks), lids_looking_down(actor)
     assert shares[0] is None
     assert shares[1] == pytest.approx(0.66, abs=0.01)
-    assert openings[1] is not None
     edge = torch.cat([openings[1].upper, openings[1].lower])
     lids = (torch.cdist(head.vertices, edge).amin(1) < 2) & ~head.loose
     whole = actor.deltas.double()
@@ -95,7 +93,6 @@ def test_a_fold_of_the_open_lid_is_flatter_when_the_eye_is_shut(actor: Blendshap
     openings = eyes_seen(head, marks)
     blinks = actor.deltas.double()
     for row, opening in enumerate(openings):
-        assert opening is not None
         line = opening.upper + torch.tensor([0.0, 4.0, 0.0], dtype=torch.float64)
         apart = torch.cdist(head.vertices[:, :2], line[:, :2]).amin(1)
         fold = 0.8 * torch.exp(-((apart / 1.1) ** 2)) * ~head.loose * (head.vertices[:, 2] > opening.upper[:, 2].min())

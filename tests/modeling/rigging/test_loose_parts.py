@@ -15,7 +15,6 @@ SHAPES = ("eyeWideLeft", "eyeBlinkLeft", "eyeSquintLeft", "eyeLookUpLeft")
 def test_a_tear_film_stays_before_the_eye_in_shapes_of_the_lids() -> None:
     actor = performer(texture=False).select(SHAPES)
     vertices, faces = actor.vertices.double(), actor.neutral.faces
-    assert actor.neutral.annotations is not None
     ball = actor.neutral.annotations.regions["eyeball_left"]
     middle, front = vertices[ball].mean(0), ball & (vertices[:, 2] > vertices[ball][:, 2].median())
     ids, film = front.nonzero()[:, 0], faces[front[faces].all(1)]
@@ -34,7 +33,7 @@ def test_a_tear_film_stays_before_the_eye_in_shapes_of_the_lids() -> None:
 def test_a_beard_that_stands_off_the_skin_goes_with_the_jaw() -> None:
     """A shell a centimetre before chin and cheeks, which the skin touches nowhere; its tip hangs from it."""
     actor = performer(texture=False).select(["jawOpen"])
-    regions, vertices = actor.neutral.annotations.regions, actor.vertices.double()  # type: ignore[union-attr]
+    regions, vertices = actor.neutral.annotations.regions, actor.vertices.double()
     chin = (regions["chin"] | regions["jaw"]) & (vertices[:, 2] > 20)
     piece = submesh(actor.neutral, chin)
     off = vertices[chin] + 10 * vertex_normals(vertices, actor.neutral.faces)[chin]

@@ -129,7 +129,7 @@ def test_lids_stay_before_an_eye_with_a_bulge_whichever_way_it_looks(strange: bo
     names = ["eyeBlinkLeft", "eyeLookUpLeft", "eyeLookDownLeft", "eyeWideLeft"]
     rig = performer(texture=False).select(names)
     rig = caricature(rig, rig.vertices[rig.neutral.landmarks], eyes=0.5) if strange else rig
-    ball = rig.neutral.annotations.regions["eyeball_left"]  # type: ignore[union-attr]
+    ball = rig.neutral.annotations.regions["eyeball_left"]
     vertices, deltas = rig.vertices.double(), rig.deltas.double()
     eye = vertices[ball]
     centre = (eye.amax(0) + eye.amin(0)) / 2
@@ -158,7 +158,7 @@ def test_a_registration_that_bent_eyeballs_gets_round_ones_behind_the_lids() -> 
     turn = rotation_matrix(torch.tensor([0.1, 0.4, -0.3], dtype=torch.float64))
     pose = Similarity(torch.tensor([1.1]).double(), turn[None], torch.tensor([[5.0, 900.0, -40.0]]).double())
     seen = torch.ones(len(spoiled), dtype=torch.bool)
-    bent = Registration(true.with_vertices(pose.apply(spoiled)[0]), pose, seen.double(), seen, None)  # type: ignore[arg-type]
+    bent = Registration(true.with_vertices(pose.apply(spoiled)[0]), pose, seen.double(), seen, None)
     found = pose.inverse().apply(with_placed_parts(template.neutral, bent).mesh.vertices)[0]
     assert float(parts.depth(spoiled).max()) > 1
     assert float(parts.depth(found).max()) <= TOLERANCE
@@ -174,7 +174,6 @@ def test_a_mouth_that_came_through_the_chin_lies_behind_it_again(pose: str) -> N
     head = rig.neutral
     if pose == "open":
         head = head.with_vertices(head.vertices + rig.deltas[rig.names.index("jawOpen")])
-    assert head.annotations is not None
     assert torch.equal(with_mouth_behind_skin(head).vertices, head.vertices)
     bag = head.annotations.regions["mouth_interior"]
     floor = bag & (head.vertices[:, 1] < head.vertices[bag, 1].min() + 6)
@@ -200,7 +199,7 @@ def test_shells_stay_behind_the_closed_lids_of_random_heads(ict_folder: Path) ->
     names = ["eyeBlink_L", "eyeBlink_R"]
     template = load_ict_facekit(ict_folder, names)
     parts = inner_parts(template)
-    regions = template.neutral.annotations.regions  # type: ignore[union-attr]
+    regions = template.neutral.annotations.regions
     hard = {name for name, mask in regions.items() if bool(mask[parts.vertices[parts.hard]].any())}
     assert hard == {"gums_and_tongue", "teeth", "eyeball_left", "eyeball_right", "eye_blend_left", "eye_blend_right"}
     assert parts.group.unique().tolist() == [0, 1, 2]

@@ -42,11 +42,11 @@ def solver() -> PlantedSolver:
 @pytest.fixture(scope="session")
 def webcam_module(solver: PlantedSolver) -> WebcamGraph:
     """What the graph computes, in PyTorch."""
-    return WebcamGraph(PlantedReader(), solver)  # type: ignore[arg-type]
+    return WebcamGraph(PlantedReader(), solver)
 
 
 @pytest.fixture(scope="session")
 def webcam_file(solver: PlantedSolver) -> bytes:
     """The graph."""
-    reading = reading_model(PlantedReader(), solver.state_size)  # type: ignore[arg-type]
+    reading = reading_model(PlantedReader(), solver.state_size)
     return webcam_model(reading, solving_model(solver), {"licence": "MIT"}).SerializeToString()

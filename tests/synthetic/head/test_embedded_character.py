@@ -182,7 +182,6 @@ def test_other_topologies_are_refused(shown) -> None:
 
 def test_gums_stay_behind_a_chin_that_lies_further_back() -> None:
     actor = performer(texture=False)
-    assert actor.neutral.annotations is not None
     vertices = actor.vertices.clone()
     vertices[actor.neutral.annotations.regions["chin"], 2] -= 9.0
     shown = character(BlendshapeRig(actor.neutral.with_vertices(vertices), actor.deltas, actor.names), size=64).rig

@@ -31,7 +31,6 @@ def test_markers_are_symmetric_apart_and_on_the_face(rig: BlendshapeRig) -> None
     layout = makeup_layout(rig)
     attachment, count = layout.attachment, len(layout.regions)
     labels = attachment.labels
-    assert labels is not None
     assert 60 <= count <= 100
     assert len(set(labels)) == count
     points = attachment.on(rig.neutral.faces, rig.vertices)
@@ -43,7 +42,6 @@ def test_markers_are_symmetric_apart_and_on_the_face(rig: BlendshapeRig) -> None
     inner = points[labels.index("browInnerL")]
     assert float((inner - rig.vertices[rig.neutral.landmarks[22]]).norm()) < 2
     corners = rig.neutral.faces[attachment.triangles]
-    assert rig.neutral.annotations is not None
     for region in ("ear_left", "ear_right", "neck", "cranium", "mouth_interior", "eyeball_left", "eyeball_right"):
         assert not rig.neutral.annotations.regions[region][corners].all(1).any(), region
     counts = layout.counts()
@@ -54,7 +52,7 @@ def test_markers_are_symmetric_apart_and_on_the_face(rig: BlendshapeRig) -> None
 
 
 def test_it_sees_lids_better_than_markers_spread_by_motion(rig: BlendshapeRig) -> None:
-    def moved(shape: str, attachment) -> float:  # type: ignore[no-untyped-def]
+    def moved(shape: str, attachment) -> float:
         points = attachment.on(rig.neutral.faces, rig.deltas[rig.names.index(shape)])
         return float(points.norm(dim=-1).square().sum().sqrt())
 

@@ -84,7 +84,6 @@ def test_truth_belongs_to_the_head(closed: Mesh, scan: RawScan) -> None:
 def test_the_texture_shows_the_head(scan: RawScan) -> None:
     mesh = scan.mesh
     assert mesh.texture is not None
-    assert mesh.uvs is not None
     assert mesh.uvs.min() >= 0
     assert mesh.uvs.max() <= 1
 

@@ -31,7 +31,6 @@ def session(filmed_session: RecordedSession) -> RecordedSession:
 def test_video_markers_and_labels_lie_beside_each_other(session: RecordedSession) -> None:
     video, take, labels = open_video(session.video.path), load_take(session.take_path), session.labels
     assert (video.width, video.height, video.fps) == (128, 170, 20.0)
-    assert take.markers is not None
     assert video.count == len(take) == labels.frames == len(session.performance.weights)
     assert abs(take.fps - video.fps) < 1e-6
     assert set(SIDE_MARKERS) < set(take.markers.names)

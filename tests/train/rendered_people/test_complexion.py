@@ -12,8 +12,6 @@ from train.rendered_people.complexion import COMPLEXION, complexion_colors, draw
 def test_the_mean_is_the_painted_skin() -> None:
     mesh = neutral_head()
     assert mesh.texture is not None
-    assert mesh.uvs is not None
-    assert mesh.uv_faces is not None
     corner = torch.zeros(len(mesh.vertices), dtype=torch.int64)
     corner[mesh.faces.flatten()] = mesh.uv_faces.flatten()
     expected = sample_texture(mesh.texture, mesh.uvs[corner].double())
@@ -22,7 +20,6 @@ def test_the_mean_is_the_painted_skin() -> None:
 
 def test_each_parameter_changes_what_it_is_named_for() -> None:
     mesh = neutral_head(texture=False)
-    assert mesh.annotations is not None
     regions = mesh.annotations.regions
     plain, changed = complexion_colors(torch.zeros(1, 6))[0], complexion_colors(2 * torch.eye(6))
     darker = (plain - changed).clamp(min=0).sum(-1)

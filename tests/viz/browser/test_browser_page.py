@@ -135,7 +135,7 @@ def test_no_permission_and_no_port_left_are_told(monkeypatch: pytest.MonkeyPatch
 
     def refuse(number: int) -> type[socket.socket]:
         class Refused(socket.socket):
-            def bind(self, address: tuple[str, int]) -> None:  # type: ignore[override]
+            def bind(self, address: tuple[str, int]) -> None:
                 tried.append(address[1])
                 raise OSError(number, "refused")
 

@@ -321,7 +321,6 @@ def test_clicks_on_head_and_scan_make_a_pair(chromium: Any, picker: Picker, two_
     picker._mode.value = "correspondences"
     vertex, other = front_vertices(two_balls)
     scan = picker.session.scan
-    assert scan is not None
     click_on(chromium, "/head/part0", two_balls.vertices[vertex])
     until(lambda: picker.session.picks.waiting == vertex)
     click_on(chromium, "/scan/part0", scan.vertices[other])

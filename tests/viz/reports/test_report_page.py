@@ -38,7 +38,7 @@ def elements(markup: str) -> list[tuple[str, set[str]]]:
     """What a browser makes of it: each element with the names of its attributes."""
     found: list[tuple[str, set[str]]] = []
     parser = HTMLParser()
-    parser.handle_starttag = lambda tag, given: found.append((tag, {name for name, _ in given}))  # type: ignore[method-assign]
+    parser.handle_starttag = lambda tag, given: found.append((tag, {name for name, _ in given}))
     parser.feed(markup)
     parser.close()
     return found

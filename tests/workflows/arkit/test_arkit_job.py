@@ -72,7 +72,6 @@ def shapes_made_once() -> Iterator[None]:
 
 def solved(path: Path, rig: BlendshapeRig) -> torch.Tensor:
     take = load_take(path)
-    assert take.weights is not None
     assert [name.lower() for name in take.weights.names] == [name.lower() for name in ARKIT]
     return rig.weights_from(take.weights)
 
@@ -253,7 +252,6 @@ def test_audio2faces_weights_go_by_name(tmp_path: Path) -> None:
     (tmp_path / "a2f.json").write_text(json.dumps(document))
     lines = animation_to_weights(tmp_path / "none.glb", tmp_path / "a2f.json", tmp_path / "w.csv", ALONE, silent)
     take = load_take(tmp_path / "w.csv")
-    assert take.weights is not None
     assert float(take.weights.select(["JawOpen"]).values[0]) == pytest.approx(0.5)
     assert "ARKit has no tongueTipUp" in lines[0]
 
@@ -271,7 +269,7 @@ def test_a_published_model_is_a_head_model_with_its_rig(
     same, shapes = matching(model)
     assert same is model
     assert shapes.names == tuple(SHAPES)
-    assert len(model.landmarks) == 68  # type: ignore[arg-type]
+    assert len(model.landmarks) == 68
 
 
 def test_what_is_of_another_model_is_named(folder: Path, rig: BlendshapeRig, tmp_path: Path) -> None:

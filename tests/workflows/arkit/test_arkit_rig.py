@@ -27,14 +27,14 @@ def test_shapes_on_ict_go_the_way_of_its_own(ict_folder: Path) -> None:
     made = make_arkit(Source(ict_folder, rig.neutral, rig), everything=True)
     assert len(made.made) == 52
     assert torch.equal(made.rig.neutral.faces, rig.neutral.faces)
-    face = rig.neutral.annotations.regions["face"]  # type: ignore[union-attr]
+    face = rig.neutral.annotations.regions["face"]
     names = [name for name in made.made if name in rig.names]
     own, truth = (one.deltas[one.index(names)][:, face].flatten(1) for one in (made.rig, rig))
     cosine = dict(zip(names, ((own * truth).sum(1) / (own.norm(dim=1) * truth.norm(dim=1))).tolist(), strict=True))
     assert float(torch.tensor(list(cosine.values())).median()) > 0.75
     for name, least in (("jawOpen", 0.88), ("eyeBlinkLeft", 0.75), ("mouthSmileRight", 0.7), ("mouthPucker", 0.8)):
         assert cosine[name] > least, (name, cosine[name])
-    teeth = rig.neutral.annotations.regions["teeth"]  # type: ignore[union-attr]
+    teeth = rig.neutral.annotations.regions["teeth"]
     opened = made.rig.deltas[made.rig.index(["jawOpen"])[0]][teeth].norm(dim=1)
     upper, lower = opened < 0.5, opened > 10
     assert bool((upper | lower).all())
@@ -48,11 +48,10 @@ def test_a_turned_head_of_another_size_without_landmarks_is_found_by_its_looks(i
     turn = rotation_matrix(torch.tensor([[0.3, 2.0, 0.2]]))[0]
     bare = Mesh(0.5 * rig.vertices @ turn.T + 300, rig.neutral.faces)
     made = make_arkit(Source(Path("turned"), bare), everything=True)
-    assert made.carried is not None
     assert made.carried.registration.record.start == "landmarks"
     row = made.rig.index(["jawOpen"])[0]
     own, truth = 2 * made.rig.deltas[row] @ turn, rig.deltas[rig.index(["jawOpen"])[0]]
-    face = rig.neutral.annotations.regions["face"]  # type: ignore[union-attr]
+    face = rig.neutral.annotations.regions["face"]
     cosine = (own[face] * truth[face]).sum() / (own[face].norm() * truth[face].norm())
     assert float(cosine) > 0.85
 
@@ -113,9 +112,8 @@ def test_the_unit_does_not_matter(monkeypatch: pytest.MonkeyPatch) -> None:
     made = make_arkit(Source(Path("large.glb"), bare(actor, 10.0).neutral))
     assert torch.equal(made.rig.vertices, 10.0 * actor.vertices)
     row, own = made.rig.index(["jawOpen"])[0], actor.deltas[actor.index(["jawOpen"])[0]]
-    face = actor.neutral.annotations.regions["face"]  # type: ignore[union-attr]
+    face = actor.neutral.annotations.regions["face"]
     assert float((made.rig.deltas[row] - 10 * own)[face].norm() / (10 * own)[face].norm()) < 0.05
-    assert made.pose is not None
     assert float(made.pose.scale[0]) == pytest.approx(10.0, rel=0.02)
     assert any(note.startswith("note: the head has 10 times the template's size") for note in made.notes)
 
@@ -131,8 +129,8 @@ def test_a_rig_that_has_all_shapes_gets_landmarks_and_regions(monkeypatch: pytes
     assert torch.equal(made.rig.deltas[made.rig.index(["jawOpen"])[0]], own.deltas[own.index(["jawOpen"])[0]])
     apart = made.rig.vertices[made.rig.neutral.landmarks] - own.vertices[actor.neutral.landmarks]
     assert float(apart.norm(dim=1).median()) < 2.5  # a millimetre at a head's size
-    regions = made.rig.neutral.annotations.regions  # type: ignore[union-attr]
-    known = actor.neutral.annotations.regions  # type: ignore[union-attr]
+    regions = made.rig.neutral.annotations.regions
+    known = actor.neutral.annotations.regions
     assert set(known) <= set(regions)
     assert float((regions["face"] == known["face"]).double().mean()) > 0.95
 

@@ -26,7 +26,6 @@ def test_labels_exchanged_in_less_than_half_move_no_site(
     dome_rig: BlendshapeRig, motion: tuple[Attachment, Take], pair: tuple[int, int], share: float
 ) -> None:
     sites, take = motion
-    assert take.markers is not None
     values = take.markers.values.clone()
     rows = slice(30, 30 + round(share * len(take)))
     values[rows, list(pair)] = values[rows, list(pair[::-1])]
@@ -44,7 +43,6 @@ def test_markers_of_the_helmet_are_named_and_those_of_the_face_are_not(
     dome_rig: BlendshapeRig, motion: tuple[Attachment, Take], count: int, seed: int
 ) -> None:
     sites, take = motion
-    assert take.markers is not None
     generator = torch.Generator().manual_seed(seed)
     places = torch.tensor([0.0, 60.0, 110.0]) + 30 * torch.randn(count, 3, generator=generator)
     on_helmet = places + 0.05 * torch.randn(len(take), count, 3, generator=generator)
@@ -75,7 +73,6 @@ def test_markers_that_no_pose_explains_are_refused_with_the_flag_that_says_where
     said: bool,
 ) -> None:
     sites, take = motion
-    assert take.markers is not None
     values = take.markers.values[:40].clone()
     phase = torch.rand(1, values[:, ::moved].shape[1], 3, generator=torch.Generator().manual_seed(0))
     values[:, ::moved] += by * torch.sin(torch.arange(len(values))[:, None, None] / 3 + 6 * phase)

@@ -109,7 +109,7 @@ def test_a_process_that_dies_while_it_reports_holds_no_other_up(words: Path) -> 
 def test_a_process_that_writes_something_else_loses_its_item_alone(words: Path, written: bytes) -> None:
     ours, theirs = multiprocessing.Pipe()
     killed: list[bool] = []
-    worker = _Worker(SimpleNamespace(kill=lambda: killed.append(True)), BatchItem("bob", words))  # type: ignore[arg-type]
+    worker = _Worker(SimpleNamespace(kill=lambda: killed.append(True)), BatchItem("bob", words))
     os.write(theirs.fileno(), written)
     theirs.close()
     with ours, pytest.raises(EOFError):

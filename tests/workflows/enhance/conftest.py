@@ -48,7 +48,6 @@ def folded(frames: Tensor, neutral: Tensor) -> Tensor:
 def actor(tmp_path_factory: pytest.TempPathFactory) -> Actor:
     folder = tmp_path_factory.mktemp("actor")
     whole = performer(texture=False)
-    assert whole.neutral.annotations is not None
     rig = whole.part(whole.neutral.annotations.regions["face"])
     generator = torch.Generator().manual_seed(0)
     extremes = torch.rand(4, len(rig.names), generator=generator) ** 5

@@ -96,8 +96,6 @@ def test_weights_become_meshes_an_animation_a_video_and_a_report(
 
 def played(path: Path) -> torch.Tensor:
     take = read_gltf_weights(path)
-    assert take is not None
-    assert take.weights is not None
     return take.weights.values[..., 0]
 
 
@@ -203,7 +201,7 @@ def test_registration_is_asked_once(actor: Actor, tmp_path: Path, monkeypatch: p
         laid = model.vertices[order]
         pose = similarity_transform(head.vertices[None].double(), laid[None].double())
         known = torch.ones(len(laid), dtype=torch.bool)
-        return Registration(Mesh(laid, head.faces), pose, torch.zeros(len(laid)), known, None)  # type: ignore[arg-type]
+        return Registration(Mesh(laid, head.faces), pose, torch.zeros(len(laid)), known, None)
 
     monkeypatch.setattr(head_correspondence, "register", register)
     for _ in range(2):
@@ -328,8 +326,6 @@ def test_learned_colours_are_images_in_a_meshs_texture_coordinates(actor: Actor,
     assert done.products["colours, an image a frame"] == out / "textures"
     assert len(list((out / "textures").glob("*.png"))) == FRAMES
     known = MeshSequence(out / "colors.safetensors").read(FRAMES - 1, FRAMES)[0]
-    assert mesh.uvs is not None
-    assert mesh.uv_faces is not None
     corner = torch.zeros(len(mesh.vertices), 2)
     corner[mesh.faces.flatten()] = mesh.uvs[mesh.uv_faces.flatten()]
     last = load_image(out / "textures" / f"frame_{FRAMES - 1:04d}.png")

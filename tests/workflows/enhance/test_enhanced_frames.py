@@ -43,7 +43,7 @@ def test_a_model_of_gradients_is_framed_where_one_of_displacements_is(actor: Act
         framed_model(EnhancementModel.fit(captured, EnhancementSettings(detail=kind), rank=4)).annotations
         for kind in ("displacements", "gradients")
     ]
-    one, other = (notes.regions["face"] for notes in seen)  # type: ignore[union-attr]
+    one, other = (notes.regions["face"] for notes in seen)
     assert float((one & other).sum() / (one | other).sum()) > 0.5
     assert float((one | other).double().mean()) < 0.9
 

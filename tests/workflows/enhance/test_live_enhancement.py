@@ -60,8 +60,6 @@ def test_a_phones_take_gets_the_models_wrinkles(actor: Actor, tmp_path: Path) ->
 def check_wrinkles(actor: Actor, take: SavedTake, frames: slice, within: float) -> None:
     """The take's enhanced meshes are what the model makes of its weights, within so many millimetres."""
     moved = read_gltf_weights(take.folder / "animation.glb")
-    assert moved is not None
-    assert moved.weights is not None
     coarse = actor.rig(moved.weights.select(actor.rig.names).values[..., 0])
     expected = load_model(actor.model)(coarse)
     assert float((expected - coarse).norm(dim=-1).max()) > 0.05

@@ -73,7 +73,6 @@ def test_the_glb_brings_rig_and_maps_back_and_the_maps_show_the_folds(
 ) -> None:
     assert load_rig(out / "wrinkles.glb").names == actor.rig.names
     found = load_region_maps(out / "wrinkles.glb")
-    assert found is not None
     assert found.regions == exported.maps.regions
     torch.testing.assert_close(found.heights, exported.maps.heights, atol=0.02, rtol=0)
     total = found.masks.sum(0)

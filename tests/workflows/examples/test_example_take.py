@@ -70,7 +70,6 @@ def test_the_command_writes_weights_and_a_row_for_each_method(
     main(["track", *map(str, words), "--out", str(tmp_path / "out"), "--quiet"])
     assert "ms a frame" in capsys.readouterr().err
     take = load_take(tmp_path / "out" / "weights.csv")
-    assert take.weights is not None
     assert take.weights.names == examples.names
     assert (take.weights.values[..., 0] - weights).abs().max() < 0.05
     rows = {row["method"]: row for row in csv.DictReader((tmp_path / "out" / "methods.csv").open())}

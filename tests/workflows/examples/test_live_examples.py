@@ -18,7 +18,7 @@ from torchface.workflows.track.head_rotations import head_angles
 
 @pytest.mark.parametrize("method", ["all", "regional", "linear"])
 def test_examples_follow_too_and_are_drawn(method: Method, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(live_examples, "load_finder", lambda name: NamedFinder(None, Path(name)))  # type: ignore[arg-type]
+    monkeypatch.setattr(live_examples, "load_finder", lambda name: NamedFinder(None, Path(name)))
     monkeypatch.setattr(live_examples, "LandmarkTracker", lambda finder, detector: GrowingSmile())
     monkeypatch.setattr(live_examples, "graph_detector", lambda: None)
     rig_examples(performer(texture=False)).save(tmp_path / "examples.json")
@@ -29,6 +29,5 @@ def test_examples_follow_too_and_are_drawn(method: Method, tmp_path: Path, monke
     assert smile[-1] > smile[1] + (0.3 if method == "all" else 0.1)
     assert float(head_angles(frames[-1].rotation.double()).abs().max()) < 0.1
     drawn = frames[-1].drawn
-    assert drawn is not None
     assert ((drawn[..., 0] > 150) & (drawn[..., 1] < 100)).sum() > 20  # the solved example's, red
     assert not picture.any()

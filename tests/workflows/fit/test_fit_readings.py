@@ -31,7 +31,6 @@ def test_irises_that_are_seen_are_points_in_front_of_the_eyeballs(visible: float
         closed=torch.tensor([[0.0, closed]]), points=torch.rand(1, 3, 2), point_deviation=torch.ones(1, 3),
     )  # fmt: skip
     surface = with_readings(FitSettings(), reading, sculpted_vertices()[:3].float(), rig).surface
-    assert surface is not None
     assert torch.equal(surface.points[0, 3], irises[0, 0])
     assert bool(surface.points[0, 4].isnan().all())  # something hides that eye, or its lids do
     places = surface.sites.on(rig.neutral.faces, rig.vertices)[3:]

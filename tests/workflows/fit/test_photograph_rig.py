@@ -94,13 +94,11 @@ def test_the_command_makes_the_actors_rig(
     made = load_rig(out)
     assert list(made.names) == SHAPES
     assert made.neutral.annotations is not None
-    assert actor.neutral.annotations is not None
     skin = actor.neutral.annotations.regions["face"]
     mean = performer(texture=False)
     assert aligned_error(made.vertices[skin], actor.vertices[skin]) < 0.6 * aligned_error(
         mean.vertices[skin], actor.vertices[skin]
     )
-    assert made.neutral.texture is not None
     assert made.neutral.texture.shape == (3, 256, 256)
     blue = made.neutral.texture[2] > made.neutral.texture[0] + 0.15
     assert float(blue.float().mean()) < 0.01  # none of the background
@@ -180,7 +178,6 @@ def test_a_rig_that_travels_with_the_model_needs_no_template(studio: Path) -> No
 @pytest.mark.bench
 def test_a_face_alone_is_fitted_as_the_head_is(studio: Path, tmp_path: Path) -> None:
     skin = performer(texture=False).neutral.annotations
-    assert skin is not None
     whole, face = (
         fit_photographs(
             [studio / "p1.png"],
@@ -197,7 +194,6 @@ def test_a_face_alone_is_fitted_as_the_head_is(studio: Path, tmp_path: Path) -> 
 
 def test_a_model_of_a_part_says_which_part_of_the_template_it_meets(studio: Path) -> None:
     template = performer(texture=False)
-    assert template.neutral.annotations is not None
     heads = load_head_model(studio / "heads").part(template.neutral.annotations.regions["face"])
     with pytest.raises(TopologyError, match=r"found 6419 vertices .*; try --part face"):
         matching(heads, studio / "template.glb")

@@ -16,7 +16,7 @@ from torchface.workflows.named_finders import NamedFinder
 
 
 def test_weights_follow_what_the_finder_reads(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(finder_solver, "load_finder", lambda name: NamedFinder(None, Path(name)))  # type: ignore[arg-type]
+    monkeypatch.setattr(finder_solver, "load_finder", lambda name: NamedFinder(None, Path(name)))
     monkeypatch.setattr(finder_solver, "LandmarkTracker", lambda finder, detector: GrowingSmile())
     monkeypatch.setattr(finder_solver, "graph_detector", lambda: None)
     solver, picture = FinderSolver("planted.onnx"), np.zeros((240, 320, 3), np.uint8)

@@ -77,8 +77,6 @@ def test_what_was_performed_is_sent_and_recorded(dome: Path, tmp_path: Path) -> 
     assert float(sent[:, JAW].max()) > 0
     ours = load_take(tmp_path / "out" / "weights.csv").weights
     unreal = load_take(tmp_path / "out" / "live_link.csv")
-    assert ours is not None
-    assert unreal.weights is not None
     assert ours.names == load_rig(dome).names  # the character's own names
     torch.testing.assert_close(ours.select(["jawOpen"]).values[:, 0, 0], sent[:, JAW])
     torch.testing.assert_close(unreal.weights.values[..., 0], sent)
@@ -89,7 +87,6 @@ def test_what_was_performed_is_sent_and_recorded(dome: Path, tmp_path: Path) -> 
     assert float(turned["LeftEyePitch"][0]) == pytest.approx(0.2)
     assert float(turned["HeadYaw"].abs().max()) == 0
     played = read_gltf_weights(tmp_path / "out" / "animation.glb")
-    assert played.weights is not None
     torch.testing.assert_close(played.weights.select(["jawOpen"]).values[:, 0, 0], sent[:, JAW])
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["found"] == len(frames)
 
@@ -102,7 +99,6 @@ def test_uneven_frames_keep_their_times(dome: Path, tmp_path: Path) -> None:
         take = log.take(30.0)
         assert take.fps == pytest.approx(5 / 0.42)
         seconds = take.seconds
-        assert seconds is not None
         np.testing.assert_allclose(seconds, times - 1000, atol=1e-9)
     recordings = Recordings(tmp_path / "out", load_character(dome), "planted", 30.0)
     recordings.start()
@@ -113,7 +109,6 @@ def test_uneven_frames_keep_their_times(dome: Path, tmp_path: Path) -> None:
     table = np.loadtxt(tmp_path / "out" / "weights.csv", delimiter=",", skiprows=1, usecols=(1,))
     np.testing.assert_allclose(table, times - 1000, atol=1e-6)
     keys = read_gltf_weights(tmp_path / "out" / "animation.glb").seconds
-    assert keys is not None
     np.testing.assert_allclose(keys, times - 1000, atol=1e-6)
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["even"] is False
 
@@ -357,7 +352,6 @@ def test_controls_reach_the_solver_and_reset_does_once(dome: Path, tmp_path: Pat
     assert solver.intervals[0] is None
     assert solver.intervals[1:] == pytest.approx([1 / 30, 1 / 30], abs=1e-6)
     view = session.next_view(None, 0.0)
-    assert view is not None
     assert float(view.solved.weights[SMILE]) == 0.25
     assert view.solved.seen
 
@@ -385,7 +379,7 @@ def test_numbers_of_a_page_that_are_none_change_nothing(dome: Path, tmp_path: Pa
     session.record(True)
     session.run()
     assert recordings.finish()[0].error == ""
-    assert bool(load_take(tmp_path / "live_link.csv").weights.values.isfinite().all())  # type: ignore[union-attr]
+    assert bool(load_take(tmp_path / "live_link.csv").weights.values.isfinite().all())
 
 
 def test_a_guided_calibration_asks_for_five_faces_in_ten_seconds(dome: Path, tmp_path: Path) -> None:
@@ -508,7 +502,7 @@ def test_a_take_that_was_dropped_outlives_a_solver_that_cannot_be_made(
 
     settings = LiveSettings(str(film(tmp_path / "film.avi", [0.0])), dome, takes=tmp_path / "out", port=0)
     with pytest.raises(ValueRangeError, match="no solver"):
-        go_live(settings, said.append, said.append, unmade)  # type: ignore[arg-type]
+        go_live(settings, said.append, said.append, unmade)
     (kept,) = kept_takes(tmp_path / "out")
     assert (kept.name, kept.frames) == ("mine", 3)
     assert said[-1] == f"what was dropped on the page is kept in {tmp_path / 'out'}"

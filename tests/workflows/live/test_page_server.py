@@ -213,7 +213,7 @@ def test_the_streams_socket_gives_frames_alone_and_takes_nothing(server: PageSer
     assert kinds == {FRAME}
     assert desk.messages == []
     with pytest.raises(InvalidStatus, match="403"):
-        connect(f"ws://127.0.0.1:{server.port}/socket", origin="http://elsewhere.test")  # type: ignore[arg-type]
+        connect(f"ws://127.0.0.1:{server.port}/socket", origin="http://elsewhere.test")
 
 
 class Steered(Endless):
@@ -340,7 +340,6 @@ def test_takes_are_recorded_played_renamed_and_deleted(page: Any, live: Opened) 
     count = len(load_live_link(live.kept / "live_link.csv"))
     assert count > 5
     take = read_gltf_weights(live.kept / "animation.glb")
-    assert take is not None
     assert len(take) == count
     assert f"{count} frames" in text(page, "takes")
     press = "document.querySelector(arguments[0]).click()"  # rows are made anew when the list changes

@@ -126,7 +126,6 @@ def test_an_iphones_packets_move_a_character_and_are_recorded_and_sent_on(
     assert float(sent[:, JAW].max()) > 0.9
     assert float(sent[:, [i for i in range(52) if i != JAW]].max()) == 0
     kept = load_take(tmp_path / "out" / "weights.csv").weights
-    assert kept is not None
     torch.testing.assert_close(kept.select(["jawOpen"]).values[:, 0, 0], sent[:, JAW])
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["source"] == f"livelink {port}"
     assert said[0].startswith(f"Waiting for a face at port {port}: have the app send to ")
@@ -151,7 +150,6 @@ def test_a_performance_of_an_iphone_is_recorded_and_sent_by_two_protocols_at_onc
     assert report.figures.found >= len(packets)
     assert report.notes == ("7 lost",)
     take = load_take(tmp_path / "out" / "live_link.csv")
-    assert take.weights is not None
     kept = take.weights.values[:, JAW, 0]
     assert float(kept.max()) == pytest.approx(float(acted[:, JAW].max()), abs=0.05)
     by_vmc, by_osc = values_by_address(vmc_packets), values_by_address(osc_packets)
@@ -167,7 +165,7 @@ def test_a_performance_of_an_iphone_is_recorded_and_sent_by_two_protocols_at_onc
 
 def a_source() -> ReceivedSource:
     """A source that a test sets."""
-    return SimpleNamespace(face=None, fresh=False)  # type: ignore[return-value]
+    return SimpleNamespace(face=None, fresh=False)
 
 
 def test_what_is_lost_is_held_then_relaxes_to_rest() -> None:
@@ -267,7 +265,6 @@ def test_only_the_newest_of_several_faces_is_given_unless_every_one_is_recorded(
         frames, found = source.frames(), []
         for _ in expected:
             next(frames)
-            assert source.face is not None
             found.append(round(source.face.weights[0].item(), 3))
         source.close()
         assert found == expected
@@ -281,7 +278,6 @@ def test_weights_that_come_one_by_one_are_one_frame_of_a_recording() -> None:
             sender.sendto(osc_message(f"/face/{name}", i / 64), ("127.0.0.1", source.receiver.port))
     next(source.frames())
     source.close()
-    assert source.face is not None
     torch.testing.assert_close(source.face.weights, torch.arange(52) / 64)
     assert source.dropped == 0
 

@@ -12,7 +12,6 @@ from torchface.workflows.live.session_prompts import GuidedCalibration, LightWat
 def test_the_calibrations_clock_stands_while_no_face_is_seen() -> None:
     calibration: GuidedCalibration | None = GuidedCalibration(3.0)
     for _ in range(100):
-        assert calibration is not None
         calibration = calibration.after(0.1, seen_at(float("nan")))
     assert calibration == GuidedCalibration(3.0)
     assert calibration.pose == 2

@@ -78,7 +78,7 @@ def test_a_mapping_table_gives_a_receiver_names_of_its_own(receiver: OscReceiver
     clips = {v[0]: v[1] for a, v in receiver.receive("/VMC/Ext/Blend/Apply") if a == "/VMC/Ext/Blend/Val"}
     assert clips == {"Mund_auf": 0.5, "Lachen": 0.0}
     sender = mapped_sender(f"osc://127.0.0.1:9/x?map={table}", ARKIT, 60.0)
-    encode = sender._sender._encode  # type: ignore[union-attr]
+    encode = sender._sender._encode
     assert "/x/weights/Mund_auf" in values_by_address(encode(torch.zeros(2), None))
     sender.close()
     with pytest.raises(NameMismatchError, match="stream: found the shapes Mund_auf, Lachen, expected some of ARKit's"):

@@ -59,7 +59,7 @@ def scans(
 
 
 def run(template: Mesh, scans: Path, out: Path, **more: object) -> BatchReport:
-    return register_scans(template, [scans], out, ScanSettings(landmarks=scans, schedule=SHORT, texture_size=0), **more)  # type: ignore[arg-type]
+    return register_scans(template, [scans], out, ScanSettings(landmarks=scans, schedule=SHORT, texture_size=0), **more)
 
 
 @pytest.fixture(scope="module")
@@ -107,7 +107,6 @@ def test_a_loose_part_that_the_scan_does_not_show_keeps_the_templates_colours(
     settings = ScanSettings(landmarks=points, schedule=SHORT, texture_size=0)
     report = register_scans(whole, [tmp_path / "grey.ply"], tmp_path / "out", settings)
     found = load_mesh(report.done[0].results[0])
-    assert found.colors is not None
     torch.testing.assert_close(found.colors[count:], colors[count:], atol=0.01, rtol=0)
     assert float((found.colors[:count] - 0.5).abs().median()) < 0.02
     left_out = replace(settings, colors=False)

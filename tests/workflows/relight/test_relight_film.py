@@ -144,7 +144,6 @@ def test_a_film_in_its_own_light_is_the_film_and_others_are_as_bright(filmed: Fi
 def test_a_bare_performer_in_the_actors_place_has_teeth_and_no_hair(tmp_path: Path) -> None:
     save_rig(performer().select(["jawOpen"]), tmp_path / "bare.glb")
     notes = other_head(tmp_path / "bare.glb").neutral.annotations
-    assert notes is not None
     assert bool(notes.regions["teeth_upper"].any())
     assert not any(name.startswith(("hair", "shirt")) and bool(mask.any()) for name, mask in notes.regions.items())
 
@@ -161,7 +160,6 @@ def test_hair_painted_on_a_head_is_left_out_and_its_face_is_not() -> None:
     capped = torch.where(at[:, None] > 0.6, torch.tensor([0.1, 0.07, 0.05]), plain)
     lips = torch.where(at[:, None] < -0.9, torch.tensor([0.5, 0.2, 0.2]), capped)
     bare_head = without_painted_hair(replace(head, colors=None, texture=texels.image(lips)))
-    assert bare_head.texture is not None
     shown = bare_head.texture.flatten(1)[:, texels.texels].T
     assert float((shown - plain)[at > 0].abs().max()) < 0.02
     torch.testing.assert_close(shown[at < 0.2], lips[at < 0.2])
@@ -170,7 +168,6 @@ def test_hair_painted_on_a_head_is_left_out_and_its_face_is_not() -> None:
 def test_hair_and_clothes_of_a_head_of_track_are_left_out() -> None:
     rig = performer(texture=False)
     notes = rig.neutral.annotations
-    assert notes is not None
     assert bare(rig) is rig
     grown = rig.neutral.vertices[:, 1] > rig.neutral.vertices[:, 1].quantile(0.8)
     named = replace(notes, regions=notes.regions | {"hair_left": grown, "shirt": torch.zeros_like(grown)})
@@ -182,7 +179,6 @@ def test_hair_and_clothes_of_a_head_of_track_are_left_out() -> None:
 def test_lashes_and_clear_shells_of_a_head_are_left_out() -> None:
     """Drawn as opaque, ICT-FaceKit's would lie over the eyes."""
     head = performer(texture=False)
-    assert head.neutral.annotations is not None
     shells = torch.zeros(len(head.vertices), dtype=torch.bool)
     shells[:90] = True
     regions = {**head.neutral.annotations.regions, "eye_occlusion_left": shells, "eyelashes": shells.roll(90)}
@@ -203,7 +199,6 @@ def test_a_light_from_behind_the_head_is_doubted() -> None:
 
 def test_the_new_light_fades_out_beside_the_face(filmed: Filmed) -> None:
     mesh = filmed.rig.neutral
-    assert mesh.annotations is not None
     regions = mesh.annotations.regions
     near = _near_face(mesh)
     assert bool((near[regions["face"]] == 1).all())

@@ -109,7 +109,6 @@ def test_the_command_brings_the_planted_rig_back(actor: Actor, capsys: pytest.Ca
     # With the true meshes in place of scans, one example takes 42 % of the error away: the rest the prior holds.
     assert inner_error(learned, actor.true)[1] < 0.8 * transferred
     maps = load_detail_maps(folder / "actor.glb")
-    assert maps is not None
     assert maps.names == ("jawOpen",)
     assert maps.maps.shape == (1, 3, 64, 64)
     assert maps.neutral is not None
@@ -205,7 +204,6 @@ def test_bad_examples_are_skipped_and_none_that_serves_ends_it(actor: Actor, tmp
         (tmp_path / name).write_bytes((actor.folder / "examples" / name).read_bytes())
     report = rig_actor(*files, marks, tmp_path)
     assert report.example_names == ("jawOpen",)
-    assert report.examples is not None
     assert float(report.examples.errors[-1, 0]) < 0.7 * float(report.examples.errors[0, 0])
     assert "skipped: example mouthSmileLeft.ply" in report.lines()[-1]
 
@@ -237,7 +235,6 @@ def test_mistakes_are_told(actor: Actor, tmp_path: Path) -> None:
 
 def test_hidden_eyeballs_and_the_mouth_keep_the_templates_skin_and_nothing_else_does() -> None:
     template = neutral_head(texture=False)
-    assert template.uvs is not None
     count = len(template.vertices)
     white = replace(template, texture=torch.ones(3, 64, 64), colors=torch.ones(count, 3))
     black = replace(template, texture=torch.zeros(3, 128, 128), colors=torch.zeros(count, 3))
@@ -246,14 +243,11 @@ def test_hidden_eyeballs_and_the_mouth_keep_the_templates_skin_and_nothing_else_
     hidden = hidden_parts(template, ~everything)
     assert 0 < int(hidden.sum()) < count / 2
     assert not hidden[template.landmarks].any()
-    assert template.annotations is not None
     assert hidden[template.annotations.regions["mouth_interior"]].all()
     eyeball = template.annotations.regions["eyeball_left"]
     front = eyeball & (template.vertices[:, 2] > template.vertices[eyeball, 2].quantile(0.75))
     assert hidden_parts(template, front)[eyeball].all()  # a quarter of a part is no picture of it
     worn = with_template_skin(black, white, hidden)
-    assert worn.colors is not None
-    assert worn.texture is not None
     assert torch.equal(worn.colors[:, 0] == 1, hidden)
     # Texels under the corners of the face's triangles are still black, under the eyeballs' white.
     middles = template.uvs[template.uv_faces].mean(1)

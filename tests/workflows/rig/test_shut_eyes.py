@@ -85,7 +85,7 @@ def test_a_character_s_shut_eye_is_one_whose_lids_meet_before_an_eyeball() -> No
         one = torch.ones(1, dtype=torch.float64)
         pose = Similarity(one, torch.eye(3).double()[None], 0 * one[:, None].expand(1, 3))
         face = SimpleNamespace(head=posed, found=SimpleNamespace(points=points, pose=pose))
-        assert eyes_shut_at_rest(face, actor.neutral) == sides  # type: ignore[arg-type]
+        assert eyes_shut_at_rest(face, actor.neutral) == sides
 
 
 def test_a_caricature_s_shut_eyes_are_recognised_though_its_balls_are_large() -> None:
@@ -96,7 +96,7 @@ def test_a_caricature_s_shut_eyes_are_recognised_though_its_balls_are_large() ->
         one = torch.ones(1, dtype=torch.float64)
         pose = Similarity(one, torch.eye(3).double()[None], 0 * one[:, None].expand(1, 3))
         found = SimpleNamespace(points=posed.vertices[actor.neutral.landmarks].double(), pose=pose)
-        shut = eyes_shut_at_rest(SimpleNamespace(head=posed, found=found), actor.neutral)  # type: ignore[arg-type]
+        shut = eyes_shut_at_rest(SimpleNamespace(head=posed, found=found), actor.neutral)
         assert shut == (blink == 1.0, blink == 1.0)
 
 
@@ -111,6 +111,6 @@ def test_a_shut_eye_opens_as_wide_as_ever_and_its_lids_do_not_pass_each_other() 
     lids = actor.deltas[left].norm(dim=-1) > 4
     for name in ("eyeLookDownLeft", "eyeSquintLeft"):
         assert float(shut.deltas[actor.index([name])[0]][lids].norm(dim=-1).max()) == 0
-    ball = actor.neutral.annotations.regions["eyeball_left"]  # type: ignore[union-attr]
+    ball = actor.neutral.annotations.regions["eyeball_left"]
     down = actor.index(["eyeLookDownLeft"])[0]
     assert torch.equal(shut.deltas[down][ball], actor.deltas[down][ball])

@@ -41,7 +41,6 @@ def recorded(
     flaws = StageFlaws(noise=0.3, slip_translation=4.0 * slips, slip_rotation=2.0 * slips)
     true = takes[which][:frames]
     take = record(rig, sites, true, torch.Generator().manual_seed(seed), flaws).take
-    assert take.markers is not None
     angle = torch.tensor(0.8)
     turn = torch.tensor([[angle.cos(), 0, angle.sin()], [0, 1, 0], [-angle.sin(), 0, angle.cos()]])
     space = Similarity(torch.ones(1), turn[None], torch.tensor([[100.0, -900.0, 40.0]]))
@@ -50,7 +49,6 @@ def recorded(
 
 def exchanged(take: Take, pair: tuple[int, int], first: int, last: int) -> Take:
     """Two labels exchanged from one frame to before another."""
-    assert take.markers is not None
     values = take.markers.values.clone()
     values[first:last, list(pair)] = values[first:last, list(pair[::-1])]
     return replace(take, markers=Track(take.markers.names, values))
@@ -81,7 +79,6 @@ def check_exchanged(capture: Capture, pair: tuple[int, int], share: float, which
     dirty = exchanged(take, pair, frames // 3, frames // 3 + round(share * frames))
     found = solve_markers(rig, sites, dirty, AS_IN_THE_HOW_TO)
     assert mesh_error(rig, found, true) < 1.1 * clean_error(capture, which, frames)
-    assert found.alignment is not None
     assert found.alignment.scale == 1.0
     assert found.warnings == ()
 

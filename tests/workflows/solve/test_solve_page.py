@@ -22,7 +22,6 @@ def page(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> P
     weights = 0.5 + 0.5 * torch.sin(torch.arange(120)[:, None] / 9 + torch.arange(4))
     flaws = StageFlaws(noise=0.05, gaps=120, gap_seconds=0.1)
     recording = record(dome_rig, true, weights, torch.Generator().manual_seed(0), flaws)
-    assert recording.take.markers is not None
     values = recording.take.markers.values.clone()
     values[50:70, [3, 20]] = values[50:70, [20, 3]]
     values[90, 5] += 15
@@ -34,8 +33,6 @@ def page(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> P
     solver = MarkerSolver(dome_rig, sites)
     cleanup = clean_take(solver, take)
     solved = solver.solve_take(cleanup.filled)
-    assert solved.weights is not None
-    assert cleanup.take.markers is not None
     markers = cleanup.take.markers.values
     solution = Solution(dome_rig, solved, markers, sites, cleanup=cleanup)
     rmse = marker_rmse(dome_rig, sites, solved.weights.values[..., 0], markers)

@@ -40,7 +40,6 @@ def stage(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> 
 
 def changed(stage: Path, name: str, change: Callable[[Tensor], Tensor]) -> Path:
     take = load_take(stage / "take.c3d")
-    assert take.markers is not None
     save_take(Take(take.fps, markers=Track(take.markers.names, change(take.markers.values))), stage / name)
     return stage / name
 
@@ -108,8 +107,6 @@ def test_a_unit_said_by_hand_gives_the_same_weights(stage: Path) -> None:
     metres = changed(stage, "metres.c3d", lambda markers: markers / 1000)
     right = load_take(solve(stage, stage / "take.c3d")).weights
     said = load_take(solve(stage, metres, "--unit", "m")).weights
-    assert right is not None
-    assert said is not None
     torch.testing.assert_close(said.values, right.values, atol=1e-3, rtol=0)
 
 
@@ -122,8 +119,6 @@ def test_a_mirrored_take_is_refused_and_flipped_by_hand(stage: Path, capsys: pyt
     each = ("--align", "--frame-by-frame")
     right = load_take(solve(stage, stage / "take.c3d", *each)).weights
     again = load_take(solve(stage, take, *each, "--flip", "y")).weights
-    assert right is not None
-    assert again is not None
     torch.testing.assert_close(again.values, right.values, atol=5e-3, rtol=0)
 
 
@@ -136,7 +131,7 @@ def test_the_scale_is_held_where_the_unit_is_known_and_warned_of(
 ) -> None:
     each = ("--align", "--frame-by-frame")
     for factor, said in ((0.98, "at 1.02"), (0.1, "the take seems to be in cm (--unit cm)")):
-        take = changed(stage, "small.c3d", lambda markers, f=factor: f * markers)  # type: ignore[misc]
+        take = changed(stage, "small.c3d", lambda markers, f=factor: f * markers)
         solve(stage, take, *each, "--scale", "free")
         printed = " ".join(capsys.readouterr().err.split())
         assert said in printed
@@ -197,7 +192,6 @@ def test_coverage_is_of_the_attachment(
     stage: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
     take = load_take(stage / "take.c3d")
-    assert take.markers is not None
     for count, name in ((12, "some.c3d"), (1, "one.c3d")):
         save_take(replace(take, markers=take.markers.select(take.markers.names[:count])), stage / name)
     solve(stage, stage / "some.c3d")
@@ -215,7 +209,6 @@ def test_coverage_is_of_the_attachment(
 
 def test_frames_that_show_too_few_markers_are_counted(stage: Path) -> None:
     take = load_take(stage / "take.c3d")
-    assert take.markers is not None
     values = take.markers.values.clone()
     values[10:17, 1:] = torch.nan
     values[10:17, 0] = 0
@@ -237,8 +230,6 @@ def test_frames_without_a_marker_are_bridged_and_named(
     written = load_take(solve(stage, changed(stage, "empty.c3d", without), *more)).weights
     assert "4 frames (20–22, 45) show no marker" in " ".join(capsys.readouterr().err.split())
     whole = load_take(solve(stage, stage / "take.c3d", *more)).weights
-    assert written is not None
-    assert whole is not None
     assert torch.isfinite(written.values).all()
     assert float((written.values - whole.values)[empty].abs().max()) < 0.1
 
@@ -246,13 +237,10 @@ def test_frames_without_a_marker_are_bridged_and_named(
 def test_solvers_put_empty_frames_between_their_neighbours(stage: Path, dome_rig: BlendshapeRig) -> None:
     solver = MarkerSolver(dome_rig, Attachment.load(stage / "attachment.json"))
     take = load_take(stage / "take.c3d")
-    assert take.markers is not None
     values = take.markers.values.clone()
     values[[0, 50, 51, 52]] = torch.nan
     gapped = Take(60.0, markers=Track(take.markers.names, values))
     full, bridged = solver.solve_take(take).weights, solver.solve_take(gapped).weights
-    assert full is not None
-    assert bridged is not None
     kept = [i for i in range(FRAMES) if i not in (0, 50, 51, 52)]
     torch.testing.assert_close(bridged.values[kept], full.values[kept], atol=1e-4, rtol=0)
     torch.testing.assert_close(bridged.values[0], bridged.values[1])

@@ -80,7 +80,6 @@ def test_what_is_sent_is_what_the_file_holds(
     main([str(word) for word in command])
     frames = [decode_frame(receiver.recv(2048)) for _ in range(12)]
     written = load_take(tmp_path / "w.csv").weights
-    assert written is not None
     jaw = torch.stack([frame.weights[ARKIT.index("jawOpen")] for frame in frames])
     assert frames[-1].rate == (240000, 1000)
     torch.testing.assert_close(jaw, written.select(["JawOpen"]).values[:, 0, 0], rtol=0, atol=1e-6)

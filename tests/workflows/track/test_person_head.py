@@ -60,13 +60,11 @@ def test_the_head_is_solved_with_the_take(actor: BlendshapeRig, take: tuple[Path
     tracked = track_video(None, None, tmp_path / "out", settings)
     made, mean = load_rig(tmp_path / "out" / "head.glb"), performer(texture=False)
     assert made.names == actor.names
-    assert actor.neutral.annotations is not None
     skin = actor.neutral.annotations.regions["face"]
     true = actor.vertices[skin]
     assert from_the_truth(made.vertices[skin], true) < 0.6 * from_the_truth(mean.vertices[skin], true)
     ahead = similarity_transform(*(one.vertices[mean.neutral.landmarks][None].double() for one in (made, mean)))
     assert float(ahead.rotation[0].diagonal().sum()) > 3 - 1e-6  # it stands as the mean head, else gaze is off
-    assert tracked.head is not None
     for camera, posed, seen in zip(
         tracked.head.fit.cameras, tracked.head.fit.posed, tracked.head.fit.landmarks, strict=True
     ):

@@ -40,8 +40,6 @@ def test_what_is_read_of_a_hidden_mouth_counts_little() -> None:
     reading = FaceReading(300 * torch.rand(2, 68, 2), torch.ones(2, 68), visible, torch.ones(2), **read)
     inputs: Any = SimpleNamespace(models=SimpleNamespace(finder="a network"))
     measured = take_measurements(inputs, solver, reading)
-    assert measured is not None
-    assert measured.weights is not None
     deviation = measured.weights.deviation
     mouth = [ARKIT.index(f"mouth{name}") for name in ("SmileLeft", "SmileRight", "Pucker")]
     brows = [ARKIT.index(name) for name in ("browDownLeft", "browOuterUpRight")]

@@ -58,7 +58,6 @@ def test_weights_are_written_at_the_frames_own_times(
             rows = list(csv.DictReader(file))
         np.testing.assert_allclose([float(row[column]) for row in rows], TIMES, atol=1e-4)
     read_back = read_gltf_weights(tmp_path / "animation.glb")
-    assert read_back is not None
     np.testing.assert_allclose(read_back.seconds.numpy(), TIMES, atol=1e-4)
     with (tmp_path / "live_link.csv").open() as file:
         codes = [row["Timecode"] for row in csv.DictReader(file)]
@@ -76,6 +75,5 @@ def test_other_readers_still_refuse_it(filmed: tuple[Path, Path, Path, Tensor]) 
         next(video.frames())
     assert len(list(replace(video, even=False).frames())) == len(TIMES)
     times, varies = video.uneven_seconds()
-    assert times is not None
     np.testing.assert_allclose(times.numpy(), TIMES, atol=1e-4)
     assert "ms as a rule" in varies

@@ -29,8 +29,6 @@ def test_priors_of_arkits_names_serve_other_spellings_and_rates(dome_rig: Blends
     names = [f"{name.removesuffix('Left')}_L" if name.endswith("Left") else name for name in dome_rig.names]
     rig = BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names)
     models = load_track_models(rig, prior="shape_prior", dynamics="dynamics_prior", fps=30.0)
-    assert models.prior is not None
-    assert models.dynamics is not None
     assert models.prior.names == models.dynamics.names == tuple(names)
     assert models.dynamics.fps == 30.0
     with pytest.raises(ValueRangeError, match=r"dynamics_prior: .*found 2 frames a second, expected from 7.5 to 480"):

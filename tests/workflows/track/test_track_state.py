@@ -52,10 +52,6 @@ def assert_same_file(path: Path, other: Path) -> None:
         return
     if path.suffix == ".glb":
         played, wanted_take = read_gltf_weights(path), read_gltf_weights(other)
-        assert played is not None
-        assert wanted_take is not None
-        assert played.weights is not None
-        assert wanted_take.weights is not None
         torch.testing.assert_close(played.weights.values, wanted_take.weights.values, atol=1e-5, rtol=0)
         return
     assert path.suffix == ".csv", path

@@ -49,20 +49,15 @@ def test_every_file_tells_the_same(done: Done) -> None:
     tracked, out = done.tracked, done.out
     own = load_take(out / "weights.csv")
     assert own.fps == 30.0
-    assert own.weights is not None
     torch.testing.assert_close(own.weights.values[..., 0], tracked.solution.weights.float())
     played = read_gltf_weights(out / "animation.glb")
-    assert played is not None
-    assert played.weights is not None
     torch.testing.assert_close(played.weights.values, own.weights.values)
     unreal = load_take(out / "live_link.csv")
-    assert unreal.weights is not None
     assert {name.lower() for name in unreal.weights.names} == {name.lower() for name in ARKIT}
     angles = head_angles(tracked.solution.rotation.double())
     for i, name in enumerate(("HeadYaw", "HeadPitch", "HeadRoll")):
         torch.testing.assert_close(unreal.extras["columns"][name], angles[:, i], atol=1e-6, rtol=0)
     marks = load_take(out / "landmarks.csv")
-    assert marks.landmarks is not None
     torch.testing.assert_close(marks.landmarks.values, tracked.reading.landmarks)
     depth = marks.extras["columns"]["pose_Tz"]
     torch.testing.assert_close(depth, tracked.solution.translation[:, 2].double(), atol=1e-3, rtol=0)
@@ -140,7 +135,7 @@ def test_a_take_shorter_than_the_window_is_told() -> None:
         window, fps = 8, 60.0
 
     take = VideoFile(Path("take.mp4"), 60.0, 160, 120, 9)
-    models = TrackModels(None, dynamics=Short())  # type: ignore[arg-type]
+    models = TrackModels(None, dynamics=Short())
     inputs = TrackInputs(QUICK, take, performer(texture=False), assumed_calibration(160, 120), models)
     inputs.check_length(9)
     with pytest.raises(ValueRangeError, match=r"take.mp4: found 8 frames, expected more than the 8"):
@@ -177,7 +172,6 @@ def test_the_verdict_comes_first(done: Done) -> None:
 
 def test_offsets_of_another_person_are_said(done: Done, filmed: Filmed, tmp_path: Path) -> None:
     inputs, own = done.tracked.inputs, done.tracked.offsets
-    assert own is not None
     assert (own.video, own.source) == (inputs.reading_key, "film.avi")
     generator = torch.Generator().manual_seed(0)
     other = replace(own, millimetres=own.millimetres + 2 * torch.randn(68, 3, generator=generator), video="another")
@@ -188,7 +182,6 @@ def test_offsets_of_another_person_are_said(done: Done, filmed: Filmed, tmp_path
     settings = TrackSettings(camera=filmed.camera, overlay="none")
     with pytest.warns(UserWarning, match=r"other.json: the offsets of film.avi lie 3\.\d mm from those .* correlate"):
         tracked = track_video(filmed.video, filmed.rig, out, replace(settings, offsets=tmp_path / "other.json"))
-    assert tracked.offsets is not None
     torch.testing.assert_close(tracked.offsets.millimetres, other.rounded().millimetres)  # as the user has it
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -209,7 +202,6 @@ def test_a_cut_to_another_face_is_said_and_not_solved(filmed: Filmed, tmp_path: 
     assert f"frames {FRAMES} to {2 * FRAMES - 1} show another face" in "\n".join(tracked.lines())
     assert (FRAMES, 2 * FRAMES - 1, "another face") in tracked.suspect_spans()
     confidence = load_take(tmp_path / "out" / "confidence.csv").weights
-    assert confidence is not None
     assert confidence.values[:FRAMES].mean() > 0.5
     assert (confidence.values[FRAMES:] == 0).all()
     insisted = track_video(tmp_path / "cut.avi", filmed.rig, tmp_path / "out", replace(QUICK, one_person=True))

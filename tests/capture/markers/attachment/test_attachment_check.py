@@ -70,12 +70,10 @@ def test_a_slipping_helmet_moves_no_site(performance: Performance) -> None:
     fit = fit_attachment(rig, recording.take, guess(rig, attachment))
     assert (site_distances(rig, fit.attachment, attachment) < 1.0).float().mean() >= 0.98
     assert float((fit.weights - recording.weights).abs().mean()) < 0.06
-    assert fit.motion is not None
     # What lasts of a slip is part of the alignment.
     found, true = (points - points.mean(0) for points in (fit.motion.translation, recording.translation.double()))
     assert float((found - true).abs().mean()) < 0.02 * float(true.norm(dim=1).max())
     markers = recording.take.markers
-    assert markers is not None
     steady = fit.motion.undo(fit.alignment.apply(markers.values.double()))
     assert float((steady - recording.markers).norm(dim=-1).median()) < 0.6  # 0.48 mm is noise
 
@@ -85,7 +83,6 @@ def test_without_slip_none_is_found(calm_fit: AttachmentFit) -> None:
 
 
 def on_a_helmet(take: Take, rows: list[int]) -> Take:
-    assert take.markers is not None
     values = take.markers.values.clone()
     noise = 0.3 * torch.randn(len(values), len(rows), 3, generator=torch.Generator().manual_seed(2))
     place = torch.tensor([[-70.0, 90, 90], [-30, 120, 110], [30, 120, 110], [70, 90, 90]])
@@ -118,7 +115,6 @@ def test_another_heads_rig_is_refused(performance: Performance) -> None:
 def test_mixed_labels_are_refused(performance: Performance) -> None:
     rig, attachment, _ = performance
     take = filmed(performance)
-    assert take.markers is not None
     order = torch.randperm(100, generator=torch.Generator().manual_seed(1)).tolist()
     mixed = Take(60.0, markers=Track([take.markers.names[i] for i in order], take.markers.values))
     with pytest.raises(AlignmentError, match="labels are mixed up"):

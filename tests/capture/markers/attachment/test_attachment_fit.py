@@ -24,7 +24,6 @@ def filmed(
 ) -> Take:
     rig, attachment, takes = performance
     recording = record(rig, attachment, takes[take], torch.Generator().manual_seed(seed), flaws or StageFlaws())
-    assert recording.take.markers is not None
     return replace(recording.take, markers=Track(attachment.labels or (), space.apply(recording.take.markers.values)))
 
 
@@ -37,7 +36,6 @@ def error_with(rig: BlendshapeRig, sites: Attachment, take: Take, true: Tensor) 
     """Mean error of the weights, the take aligned to these sites and what is left at rest subtracted."""
     alignment = align_take(rig, sites, take)
     solved = MarkerSolver(rig, rest_residual(rig, sites, take, alignment), alignment).solve_take(take)
-    assert solved.weights is not None
     return float((solved.weights.values[..., 0] - true).abs().mean())
 
 
@@ -76,7 +74,6 @@ def test_markers_that_stand_off_the_skin(performance: Performance, stage_space: 
     fit = fit_attachment(rig, take, misplaced(rig, attachment, torch.Generator().manual_seed(1)), standoff=True)
     assert (site_distances(rig, fit.attachment, attachment) < 1.0).float().mean() >= 0.85
     assert 1.4 < fit.standoff < 2.2
-    assert fit.attachment.residual is not None
     assert 1.4 < float(fit.attachment.residual.norm(dim=1).mean()) < 2.3
 
 
@@ -147,7 +144,6 @@ def test_the_first_guess_is_found_by_shape(performance: Performance, stage_space
     assert guess.labels == attachment.labels
     assert site_distances(rig, guess, attachment).median() < 4.0
     assert site_distances(rig, guess, attachment).max() < 10.0
-    assert take.markers is not None
     few = Take(60.0, markers=take.markers.select(take.markers.names[:8]))
     with pytest.raises(ValueRangeError, match="found 8, expected at least 12"):
         sites_by_shape(rig, few)

@@ -23,7 +23,6 @@ def recording(performance: Performance) -> Recording:
 
 @pytest.fixture(scope="module")
 def markers(recording: Recording) -> Tensor:
-    assert recording.take.markers is not None
     return recording.take.markers.values.double()
 
 
@@ -64,7 +63,6 @@ def test_labels_in_order_are_left_in_real_takes(real_capture: Performance) -> No
     rig, attachment, takes = real_capture
     for seed, weights in enumerate(takes):
         take = record(rig, attachment, weights[::4], torch.Generator().manual_seed(seed), FLAWS).take
-        assert take.markers is not None
         assert find_swaps_by_shape(take.markers.values.double(), 15.0) == []
 
 
@@ -73,7 +71,6 @@ def test_labels_exchanged_in_the_whole_take_are_found_and_put_back(
     performance: Performance, recording: Recording, cycle: tuple[int, ...]
 ) -> None:
     rig, attachment, _ = performance
-    assert recording.take.markers is not None
     values = recording.take.markers.values
     dirty = values.clone()
     dirty[:, list(cycle)] = values[:, [*cycle[1:], cycle[0]]]
@@ -81,6 +78,5 @@ def test_labels_exchanged_in_the_whole_take_are_found_and_put_back(
     cleanup = clean_take(MarkerSolver(rig, attachment), replace(recording.take, markers=Track(names, dirty)), slip=True)
     swaps = [defect for defect in cleanup.defects if defect.kind == "swap"]
     assert [(set(swap.labels), swap.first, swap.last) for swap in swaps] == [({names[m] for m in cycle}, 0, 299)]
-    assert cleanup.take.markers is not None
     kept = ~cleanup.masked & ~torch.isnan(values).any(-1)
     assert torch.equal(cleanup.take.markers.values[kept], values[kept])

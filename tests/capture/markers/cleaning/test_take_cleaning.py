@@ -20,7 +20,6 @@ DIRT = StageFlaws(missing=0.3, swaps=60, swap_seconds=1.0)
 
 def with_holes(recording: Recording, attachment: Attachment, rig: BlendshapeRig, generator: torch.Generator) -> Take:
     """Ten frames without any of fifteen neighbours, every second or two."""
-    assert recording.take.markers is not None
     values = recording.take.markers.values.clone()
     points = attachment.on(rig.neutral.faces, rig.vertices)
     near = torch.cdist(points, points).argsort(1)[:, :15]
@@ -32,7 +31,6 @@ def with_holes(recording: Recording, attachment: Attachment, rig: BlendshapeRig,
 
 def named(recording: Recording, take: Take, cleanup: Cleanup) -> tuple[int, int]:
     """How many of the stretches with exchanged labels, as far as they show, are named; and of how many."""
-    assert take.markers is not None
     count, shown = 0, 0
     for swap in recording.swaps:
         frames = torch.arange(swap.first, swap.last)
@@ -56,18 +54,14 @@ def check_dirty_take(performance: Performance, which: int, frames: int) -> None:
     recording = record(rig, attachment, true, generator, DIRT)
     dirty = with_holes(recording, attachment, rig, generator)
     clean = record(rig, attachment, true, generator).take.markers
-    assert clean is not None
-    assert dirty.markers is not None
     before = dirty.markers.values.clone()
     cleanup = clean_take(solver, dirty)
     torch.testing.assert_close(dirty.markers.values, before, rtol=0, atol=0, equal_nan=True)
-    assert cleanup.take.markers is not None
     rows = slice(None, None, 10)
 
     def error(markers: Tensor) -> float:
         return float((solver(markers[rows]) - true[rows]).abs().mean())
 
-    assert cleanup.filled.markers is not None
     assert error(cleanup.filled.markers.values) <= 1.25 * error(clean.values)
     assert error(cleanup.take.markers.values) <= 1.35 * error(clean.values)
     assert error(before) > 1.5 * error(clean.values)
@@ -95,7 +89,6 @@ def test_a_dirty_real_take(real_capture: Performance) -> None:
 
 def spoiled(take: Take) -> Take:
     """A spike, a marker that drifts, one that falls off, two neighbours exchanged, a short and a long gap."""
-    assert take.markers is not None
     values = take.markers.values.clone()
     values[100, 10] += torch.tensor([8.0, 0, 0])
     values[200:, 20] += torch.linspace(0, 15, len(values) - 200)[:, None] * torch.tensor([0.0, -0.8, 0.6])
@@ -111,10 +104,8 @@ def test_each_defect_is_named_with_its_frames(performance: Performance, stage_sp
     rig, attachment, takes = performance
     flaws = StageFlaws(slip_translation=8, slip_rotation=3) if slip else StageFlaws()
     recording = record(rig, attachment, takes[0][:500], torch.Generator().manual_seed(3), flaws)
-    assert recording.take.markers is not None
     whole = recording.take.markers.values
     take = spoiled(recording.take)
-    assert take.markers is not None
     moved = replace(take, markers=Track(take.markers.names, stage_space.apply(take.markers.values)))
     solver = MarkerSolver(rig, attachment, stage_space.inverse())
     cleanup = clean_take(solver, moved, slip)
@@ -132,7 +123,6 @@ def test_each_defect_is_named_with_its_frames(performance: Performance, stage_sp
     assert (fallen.first, fallen.last) == (350, 499)
     assert found["gap", ("M051",)].action == "filled"
     assert found["gap", ("M052",)].action == "left"
-    assert cleanup.filled.markers is not None
     filled = stage_space.inverse().apply(cleanup.filled.markers.values)
     assert (filled[300:306, 50] - whole[300:306, 50]).norm(dim=-1).max() < 2.5
     assert torch.isnan(filled[300:360, 51]).all()
@@ -150,11 +140,8 @@ def test_each_defect_is_named_with_its_frames(performance: Performance, stage_sp
 def test_a_clean_take_stays_bit_for_bit(performance: Performance) -> None:
     rig, attachment, takes = performance
     take = record(rig, attachment, takes[1][:200], torch.Generator().manual_seed(0), StageFlaws(missing=0.01)).take
-    assert take.markers is not None
     few = Take(60.0, markers=take.markers.select(list(reversed(take.markers.names[:90]))))
     cleanup = clean_take(MarkerSolver(rig, attachment), few)
-    assert cleanup.take.markers is not None
-    assert few.markers is not None
     assert cleanup.take.markers.names == few.markers.names
     torch.testing.assert_close(cleanup.take.markers.values, few.markers.values, rtol=0, atol=0, equal_nan=True)
     assert not cleanup.masked.any()

@@ -22,7 +22,6 @@ from torchface.synthetic import performer
 def performance() -> tuple[torch.Tensor, torch.Tensor]:
     """Landmarks (T,68,2) of a face that makes one expression after another, and which one each frame is nearest to."""
     rig = performer(texture=False)
-    assert rig.neutral.annotations is not None
     ids = rig.neutral.annotations.landmarks
     poses = expression_weights(rig.names, list(EXPRESSIONS.values()))
     rise = torch.cat([torch.linspace(0, 1, 6), torch.linspace(0.8, 0, 5)])

@@ -372,7 +372,7 @@ def test_bad_input_is_refused_by_name(film: PortraitVideo, model: AppearanceMode
     with pytest.raises(ShapeError, match=r"expected \(B,1,H,W\) or \(B,3,H,W\)"):
         model(images(film)[:2, 0], points[:2])
     with pytest.raises(NameMismatchError, match="expected one of grey"):
-        AppearanceSettings(features="sift")  # type: ignore[arg-type]
+        AppearanceSettings(features="sift")
     with pytest.raises(ValueRangeError, match="iterations"):
         AppearanceSettings(iterations=0)
 

@@ -34,7 +34,7 @@ def stand_in(presence: float = 3.0) -> LandmarkerBundle:
         landmarks=lambda crop: (seen, np.full((1, 1, 1, 1), presence, np.float32)),
         blendshapes=lambda points: (np.arange(52, dtype=np.float32) / 100,),
         boxes=lambda picture: (np.zeros((1, 896, 16), np.float32), np.full((1, 896, 1), -9.0, np.float32)),
-    )  # type: ignore[arg-type]
+    )
 
 
 def test_names_and_points_are_the_networks() -> None:
@@ -111,7 +111,6 @@ def test_a_real_face_is_read_as_mediapipe_reads_it(data: Path) -> None:
         if number == 6:
             break
         face = tracker.mesh(frame)
-        assert face is not None
         eyes = (reference[number, 36] - reference[number, 45]).norm()
         for landmarks in (landmarks_of_mesh(face.points), found(finder, frame, reference[number])):
             assert (landmarks - reference[number]).norm(dim=1).mean() < 0.016 * eyes

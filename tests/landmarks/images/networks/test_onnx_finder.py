@@ -172,8 +172,6 @@ def test_a_graph_that_never_ends_ends_with_its_parent(tmp_path: Path) -> None:
     crop = graph_process.packed(np.full((1, 3, S, S), 0.5, np.float32))
     command = [sys.executable, "-I", graph_process.__file__, "512"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        assert process.stdin is not None
-        assert process.stdout is not None
         process.stdin.write(b"".join(struct.pack("<Q", len(one)) + one for one in (graph, crop)))
         process.stdin.flush()
         (count,) = struct.unpack("<I", process.stdout.read(4))
