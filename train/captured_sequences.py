@@ -65,19 +65,12 @@ class CapturedSequence:
 
 @dataclass(frozen=True, eq=False)
 class Capture:
-    """Sequences of an actor, and the neutral of their topology.
+    """Sequences of an actor, and the neutral of their topology."""
 
-    Args:
-        sequences: in order of their names.
-        neutral: with landmarks where it came with some.
-        neutral_file: where it came from; None of the performer.
-        key: changes when any of the files does.
-    """
-
-    sequences: tuple[CapturedSequence, ...]
-    neutral: Mesh
-    neutral_file: Path | None
-    key: str
+    sequences: tuple[CapturedSequence, ...]  # in order of their names
+    neutral: Mesh  # with landmarks where it came with some
+    neutral_file: Path | None  # where it came from; None of the performer
+    key: str  # changes when any of the files does
 
     def part(self, begin: int, end: int) -> "Capture":
         """Some of the sequences."""

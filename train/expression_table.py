@@ -23,20 +23,13 @@ _MANY, _TESTED = 100, 50
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Squared errors of every person left out, mm², in the order of ``METHODS``.
+    """Squared errors of every person left out, mm², in the order of ``METHODS``."""
 
-    Args:
-        squared: (M,N,3), summed over the vertices.
-        predicted: offsets (3,N,V,3) of those people who are kept for pictures, by their number.
-        learned: how many people each was predicted from.
-        distances: of each from those, (M,); see ``ExpressionRegression.distance``.
-    """
-
-    squared: Tensor
+    squared: Tensor  # (M,N,3), summed over the vertices
     names: tuple[str, ...]
-    predicted: dict[int, Tensor]
-    learned: int
-    distances: Tensor
+    predicted: dict[int, Tensor]  # offsets (3,N,V,3) of those people who are kept for pictures, by their number
+    learned: int  # how many people each was predicted from
+    distances: Tensor  # of each from those, (M,); see ExpressionRegression.distance
 
     def expected(self) -> Tensor:
         """Mean squared errors of regression, at distance 0, and of transfer, (2,N)."""

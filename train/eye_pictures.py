@@ -24,25 +24,15 @@ EACH = 5
 
 @dataclass(frozen=True, eq=False)
 class EyePictures:
-    """Pictures in memory, see :class:`~train.rendered_people.eye_picture.EyePicture`.
+    """Pictures in memory, see :class:`~train.rendered_people.eye_picture.EyePicture`."""
 
-    Args:
-        rgba: uint8 (M,4,H,W).
-        landmarks: (M,68,2) pixels.
-        visible: of landmarks 36 to 47, (M,12) bool.
-        iris: (M,2,2) pixels.
-        openness: (M,2).
-        bare: (M,2) square millimetres.
-        gaze: (M,2,2) radians.
-    """
-
-    rgba: Tensor
-    landmarks: Tensor
-    visible: Tensor
-    iris: Tensor
-    openness: Tensor
-    bare: Tensor
-    gaze: Tensor
+    rgba: Tensor  # uint8 (M,4,H,W)
+    landmarks: Tensor  # (M,68,2) pixels
+    visible: Tensor  # of landmarks 36 to 47, (M,12) bool
+    iris: Tensor  # (M,2,2) pixels
+    openness: Tensor  # (M,2)
+    bare: Tensor  # (M,2) square millimetres
+    gaze: Tensor  # (M,2,2) radians
 
     def __len__(self) -> int:
         return len(self.rgba)

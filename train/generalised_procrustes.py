@@ -18,17 +18,11 @@ _MAX_ITERATIONS = 20
 
 @dataclass(frozen=True, eq=False)
 class Procrustes:
-    """Shapes on their mean.
+    """Shapes on their mean."""
 
-    Args:
-        poses: what moves each shape, a batch of M, float64.
-        mean: of the moved shapes, (V,3) float64.
-        iterations: how many were made.
-    """
-
-    poses: Similarity
-    mean: Tensor
-    iterations: int
+    poses: Similarity  # what moves each shape, a batch of M, float64
+    mean: Tensor  # of the moved shapes, (V,3) float64
+    iterations: int  # how many were made
 
 
 def generalised_procrustes(

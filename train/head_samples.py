@@ -32,16 +32,11 @@ _FACE, _LEAST_FACE, _MOST_FACE = 250.0, 0.4, 4.0  # millimetres across, and how 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """Meshes that are read one by one.
-
-    Args:
-        read: gives the mesh of a number.
-        key: changes when anything about them does.
-    """
+    """Meshes that are read one by one."""
 
     names: list[str]
-    read: Callable[[int], Mesh]
-    key: str
+    read: Callable[[int], Mesh]  # gives the mesh of a number
+    key: str  # changes when anything about them does
 
 
 @dataclass(frozen=True, eq=False)

@@ -135,17 +135,11 @@ def first_network(settings: Settings) -> LandmarkNetwork:
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """What a network reads of pictures that it did not learn from, and the truth.
+    """What a network reads of pictures that it did not learn from, and the truth."""
 
-    Args:
-        crops: what it was shown, and where all marks are.
-        weights: that are posed, (M,52).
-        found: by the network, as it is calibrated.
-    """
-
-    crops: Crops
-    weights: Tensor
-    found: NetworkLandmarks
+    crops: Crops  # what it was shown, and where all marks are
+    weights: Tensor  # that are posed, (M,52)
+    found: NetworkLandmarks  # by the network, as it is calibrated
 
 
 @torch.no_grad()

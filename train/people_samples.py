@@ -28,21 +28,13 @@ _HELD_BYTES = 2**28
 
 @dataclass(frozen=True, eq=False)
 class People:
-    """Who is learned from.
+    """Who is learned from."""
 
-    Args:
-        who: M names.
-        template: the topology, and what is annotated on it.
-        neutrals: (M,V,3), millimetres.
-        offsets: of the expressions, one after the other, (M,N·V,3).
-        names: of the N expressions.
-    """
-
-    who: tuple[str, ...]
-    template: Mesh
-    neutrals: Samples
-    offsets: Samples
-    names: tuple[str, ...]
+    who: tuple[str, ...]  # M names
+    template: Mesh  # the topology, and what is annotated on it
+    neutrals: Samples  # (M,V,3), millimetres
+    offsets: Samples  # of the expressions, one after the other, (M,N·V,3)
+    names: tuple[str, ...]  # of the N expressions
 
     @staticmethod
     def of(who: Sequence[str], template: Mesh, neutrals: Tensor, offsets: Tensor, names: Sequence[str]) -> People:

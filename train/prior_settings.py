@@ -81,18 +81,12 @@ class PriorSettings(RecipeSettings):
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """What both kinds learn from.
-
-    Args:
-        test: takes that are looked at once, for the card.
-        rig: on which trial solves are made.
-        silent: shapes that the takes say nothing of.
-    """
+    """What both kinds learn from."""
 
     learn: PriorTakes
-    test: PriorTakes
-    rig: BlendshapeRig
-    silent: tuple[str, ...]
+    test: PriorTakes  # takes that are looked at once, for the card
+    rig: BlendshapeRig  # on which trial solves are made
+    silent: tuple[str, ...]  # shapes that the takes say nothing of
 
 
 @dataclass(frozen=True, eq=False)

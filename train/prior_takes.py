@@ -25,25 +25,15 @@ _SAME_RATE = 1e-3  # relative; 59.94 and 60 frames a second are not the same, ro
 
 @dataclass(frozen=True, eq=False)
 class PriorTakes:
-    """Takes of one set of shapes at one frame rate.
+    """Takes of one set of shapes at one frame rate."""
 
-    Args:
-        names: of the N shapes.
-        fps: frames a second.
-        weights: of each take, (T,N), clipped to [0,1]; read from disk as they are asked for.
-        labels: what each take is called.
-        frames: T of each take.
-        people: whom each take shows, by any name.
-        solved: how many of them were solved from markers.
-    """
-
-    names: tuple[str, ...]
-    fps: float
-    weights: Sequence[Tensor]
-    labels: Sequence[str]
-    frames: Sequence[int]
-    people: Sequence[str]
-    solved: int = 0
+    names: tuple[str, ...]  # of the N shapes
+    fps: float  # frames a second
+    weights: Sequence[Tensor]  # of each take, (T,N), clipped to [0,1]; read from disk as they are asked for
+    labels: Sequence[str]  # what each take is called
+    frames: Sequence[int]  # T of each take
+    people: Sequence[str]  # whom each take shows, by any name
+    solved: int = 0  # how many of them were solved from markers
 
     def some(self, rows: Sequence[int]) -> "PriorTakes":
         """Some of the takes; none is read."""

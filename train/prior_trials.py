@@ -18,21 +18,13 @@ _LEAST_SHAPES = 0.5  # of those that a rig must know for a trial
 
 @dataclass(frozen=True, eq=False)
 class OneStep:
-    """Predictions of the frames of held-out takes.
+    """Predictions of the frames of held-out takes."""
 
-    Args:
-        errors: (B,N).
-        deviations: predicted, (B,N).
-        persistence: errors of the last frame as prediction, (B,N).
-        extrapolation: errors of the line through the last two frames, (B,N).
-        changing: which weights truly change by more than a thousandth, (B,N) bool.
-    """
-
-    errors: Tensor
-    deviations: Tensor
-    persistence: Tensor
-    extrapolation: Tensor
-    changing: Tensor
+    errors: Tensor  # (B,N)
+    deviations: Tensor  # predicted, (B,N)
+    persistence: Tensor  # errors of the last frame as prediction, (B,N)
+    extrapolation: Tensor  # errors of the line through the last two frames, (B,N)
+    changing: Tensor  # which weights truly change by more than a thousandth, (B,N) bool
 
     def metrics(self) -> dict[str, float]:
         """Root mean squares in weights, the share of frames within k deviations, the mean negative log likelihood."""
@@ -64,21 +56,13 @@ def one_step(prior: DynamicsPrior, takes: Sequence[Tensor], noise: float = 0.0) 
 
 @dataclass(frozen=True, eq=False)
 class SyntheticVideo:
-    """Held-out frames as one camera sees them.
+    """Held-out frames as one camera sees them."""
 
-    Args:
-        rig: with the shapes of the takes.
-        intrinsics: of the camera, (3,3), pixels.
-        landmarks: (B,68,2), pixels, with noise.
-        rotation: of the head, which no solver is given, (B,3,3).
-        truth: the frames' weights, (B,N).
-    """
-
-    rig: BlendshapeRig
-    intrinsics: Tensor
-    landmarks: Tensor
-    rotation: Tensor
-    truth: Tensor
+    rig: BlendshapeRig  # with the shapes of the takes
+    intrinsics: Tensor  # of the camera, (3,3), pixels
+    landmarks: Tensor  # (B,68,2), pixels, with noise
+    rotation: Tensor  # of the head, which no solver is given, (B,3,3)
+    truth: Tensor  # the frames' weights, (B,N)
 
 
 def synthetic_video(

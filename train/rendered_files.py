@@ -23,20 +23,13 @@ Render = Callable[[int, int, int, Path | None], Mapping[str, Tensor]]
 
 @dataclass(frozen=True)
 class Rendering:
-    """What is rendered.
+    """What is rendered."""
 
-    Args:
-        render: the pictures of a file; a function of a module, so that processes can import it.
-        method: name and version; files of another one are not taken up.
-        what: it shows, in a word, for the progress.
-        part: pictures in a file.
-    """
-
-    render: Render
-    method: str
+    render: Render  # the pictures of a file; a function of a module, so that processes can import it
+    method: str  # name and version; files of another one are not taken up
     prefix: str
-    what: str
-    part: int
+    what: str  # it shows, in a word, for the progress
+    part: int  # pictures in a file
 
 
 def rendered_files(

@@ -15,14 +15,10 @@ _MOST = 40  # frames that are measured of what was learned
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """Captured frames, and what a coarse animation shows of each where that is known.
-
-    Args:
-        coarse: the same frames in the same places, coarse; their own smooth part if None.
-    """
+    """Captured frames, and what a coarse animation shows of each where that is known."""
 
     truth: MeshSequence
-    coarse: MeshSequence | None
+    coarse: MeshSequence | None  # the same frames in the same places, coarse; their own smooth part if None
 
     def __len__(self) -> int:
         return len(self.truth)
@@ -30,18 +26,12 @@ class Shown:
 
 @dataclass(frozen=True, eq=False)
 class Restored:
-    """One frame, aligned with the neutral.
+    """One frame, aligned with the neutral."""
 
-    Args:
-        truth: as captured, (V,3), millimetres.
-        smooth: what the model sees: its smooth part, or the coarse animation.
-        outside: the share of the regions for which the frame lies outside the database.
-    """
-
-    truth: Tensor
-    smooth: Tensor
+    truth: Tensor  # as captured, (V,3), millimetres
+    smooth: Tensor  # what the model sees: its smooth part, or the coarse animation
     restored: Tensor
-    outside: float
+    outside: float  # the share of the regions for which the frame lies outside the database
 
 
 @torch.no_grad()

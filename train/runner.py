@@ -35,19 +35,12 @@ _CONFIG = (
 
 @dataclass(frozen=True, eq=False)
 class Run:
-    """What a recipe is given beside its settings.
+    """What a recipe is given beside its settings."""
 
-    Args:
-        progress: called with each step and how far it is.
-        log: called with what is measured on the way; see :class:`~torchface.progress.ValueLog`.
-        work: folder for what a run that goes on takes up; gone when the run has come to its end.
-        device: where to compute.
-    """
-
-    progress: Progress
-    log: RunLog
-    work: Path
-    device: torch.device
+    progress: Progress  # called with each step and how far it is
+    log: RunLog  # called with what is measured on the way; see ValueLog
+    work: Path  # folder for what a run that goes on takes up; gone when the run has come to its end
+    device: torch.device  # where to compute
 
     @property
     def checkpoint(self) -> Path:

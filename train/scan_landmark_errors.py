@@ -17,20 +17,13 @@ _FOUND, _TRUE = (1.0, 0.1, 0.1), (0.1, 0.9, 0.2)
 
 @dataclass(frozen=True, eq=False)
 class ScanErrors:
-    """Errors on one scan.
-
-    Args:
-        pixels: of each landmark, (L,); NaN where the truth is not known.
-        millimetres: the same in space, (L,).
-        lines: by name, mean distance in pixels of the traced points that were kept to the true line.
-        stray: by name, mean distance to the true line of all traced points.
-    """
+    """Errors on one scan."""
 
     name: str
-    pixels: Tensor
-    millimetres: Tensor
-    lines: dict[str, float]
-    stray: dict[str, float]
+    pixels: Tensor  # of each landmark, (L,); NaN where the truth is not known
+    millimetres: Tensor  # the same in space, (L,)
+    lines: dict[str, float]  # by name, mean distance in pixels of the traced points that were kept to the true line
+    stray: dict[str, float]  # by name, mean distance to the true line of all traced points
 
     @property
     def mean_pixels(self) -> float:

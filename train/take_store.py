@@ -17,33 +17,21 @@ from .tensor_shards import Shards
 
 @dataclass(frozen=True, eq=False)
 class StoredTake:
-    """A take as it is stored.
+    """A take as it is stored."""
 
-    Args:
-        names: of the N shapes.
-        fps: frames a second.
-        weights: (T,N).
-        solved: whether they were solved from markers.
-    """
-
-    names: tuple[str, ...]
-    fps: float
-    weights: Tensor
-    solved: bool
+    names: tuple[str, ...]  # of the N shapes
+    fps: float  # frames a second
+    weights: Tensor  # (T,N)
+    solved: bool  # whether they were solved from markers
 
 
 @dataclass(frozen=True, eq=False)
 class TakesRead(Sequence[Tensor]):
-    """Some takes of others, each read, and changed, when it is asked for.
+    """Some takes of others, each read, and changed, when it is asked for."""
 
-    Args:
-        takes: weights of each, (T,N).
-        change: what is done with each; nothing if absent.
-    """
-
-    takes: Sequence[Tensor]
+    takes: Sequence[Tensor]  # weights of each, (T,N)
     rows: tuple[int, ...]
-    change: Callable[[Tensor], Tensor] | None = None
+    change: Callable[[Tensor], Tensor] | None = None  # what is done with each; nothing if absent
 
     def __len__(self) -> int:
         return len(self.rows)

@@ -44,23 +44,14 @@ class PerformanceSettings:
 
 @dataclass(frozen=True, eq=False)
 class ActionPerformance:
-    """What was done, and the truth behind it.
+    """What was done, and the truth behind it."""
 
-    Args:
-        names: of the shapes, N.
-        weights: (T,N) in [0,1].
-        units: names of the action units, A.
-        intensities: (T,A) in [0,1].
-        performed: what was asked for when.
-        fps: frames a second.
-    """
-
-    names: tuple[str, ...]
-    weights: Tensor
-    units: tuple[str, ...]
-    intensities: Tensor
-    performed: tuple[Performed, ...]
-    fps: float
+    names: tuple[str, ...]  # of the shapes, N
+    weights: Tensor  # (T,N) in [0,1]
+    units: tuple[str, ...]  # names of the action units, A
+    intensities: Tensor  # (T,A) in [0,1]
+    performed: tuple[Performed, ...]  # what was asked for when
+    fps: float  # frames a second
 
 
 def perform_action_units(

@@ -37,25 +37,15 @@ _SIDES = ("Right", "Left")
 
 @dataclass(frozen=True, eq=False)
 class EyePicture:
-    """One picture; the person's right eye comes first.
+    """One picture; the person's right eye comes first."""
 
-    Args:
-        rgba: uint8 (4,H,W); the fourth channel is 255 on the person, 0 on what is behind.
-        landmarks: iBUG's 68 as an annotator sees them, (68,2) pixels; most lie outside.
-        visible: which of landmarks 36 to 47 nothing hides, (12,) bool.
-        iris: centres of the irises, (2,2) pixels.
-        openness: the lids' distance on the head over that of the eye's corners, (2,).
-        bare: how much of each eyeball is seen between the lids, (2,) square millimetres.
-        gaze: of each eye, (2,2) radians: to the person's left, up.
-    """
-
-    rgba: Tensor
-    landmarks: Tensor
-    visible: Tensor
-    iris: Tensor
-    openness: Tensor
-    bare: Tensor
-    gaze: Tensor
+    rgba: Tensor  # uint8 (4,H,W); the fourth channel is 255 on the person, 0 on what is behind
+    landmarks: Tensor  # iBUG's 68 as an annotator sees them, (68,2) pixels; most lie outside
+    visible: Tensor  # which of landmarks 36 to 47 nothing hides, (12,) bool
+    iris: Tensor  # centres of the irises, (2,2) pixels
+    openness: Tensor  # the lids' distance on the head over that of the eye's corners, (2,)
+    bare: Tensor  # how much of each eyeball is seen between the lids, (2,) square millimetres
+    gaze: Tensor  # of each eye, (2,2) radians: to the person's left, up
     person: int
 
 

@@ -30,23 +30,14 @@ _PEOPLES = 0.6  # of the expressions are those of people who talk and feel; the 
 
 @dataclass(frozen=True, eq=False)
 class FacePicture:
-    """One picture.
+    """One picture."""
 
-    Args:
-        rgba: uint8 (4,S,S); the fourth channel is 255 on the person, 0 on what is behind.
-        landmarks: iBUG's 68 as an annotator sees them, (68,2) pixels.
-        visible: which of them nothing hides, (68,) bool.
-        points: of the face's surface, (P,2) pixels; see ``dense_points``.
-        point_visible: which of them nothing hides, (P,) bool.
-        weights: the expression, (52,) by ARKit's names; a blink of 1 closes this person's lids.
-    """
-
-    rgba: Tensor
-    landmarks: Tensor
-    visible: Tensor
-    points: Tensor
-    point_visible: Tensor
-    weights: Tensor
+    rgba: Tensor  # uint8 (4,S,S); the fourth channel is 255 on the person, 0 on what is behind
+    landmarks: Tensor  # iBUG's 68 as an annotator sees them, (68,2) pixels
+    visible: Tensor  # which of them nothing hides, (68,) bool
+    points: Tensor  # of the face's surface, (P,2) pixels; see dense_points
+    point_visible: Tensor  # which of them nothing hides, (P,) bool
+    weights: Tensor  # the expression, (52,) by ARKit's names; a blink of 1 closes this person's lids
     person: int
 
 

@@ -49,15 +49,10 @@ class ScenePeople(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class CutOuts:
-    """People without a background.
+    """People without a background."""
 
-    Args:
-        pictures: red, green, blue, and 0 where nobody is, uint8 (N,4,S,S).
-        landmarks: iBUG's 68 of each, (N,68,2) pixels.
-    """
-
-    pictures: Tensor
-    landmarks: Tensor
+    pictures: Tensor  # red, green, blue, and 0 where nobody is, uint8 (N,4,S,S)
+    landmarks: Tensor  # iBUG's 68 of each, (N,68,2) pixels
 
     def __post_init__(self) -> None:
         count, shape = len(self.pictures), tuple(self.pictures.shape)

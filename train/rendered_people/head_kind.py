@@ -49,31 +49,18 @@ class DrawnHead:
 
 @dataclass(frozen=True, eq=False)
 class HeadKind:
-    """A topology, and how people of it are drawn.
+    """A topology, and how people of it are drawn."""
 
-    Args:
-        faces: (F,3).
-        material: of each face, (F,).
-        landmarks: vertices of iBUG's 68, (68,).
-        canonical: each vertex on the performer's sculpture, (V,3).
-        marks: what skin is painted by, (V,8); see ``skin_texture``.
-        outer: vertices of the skin that can be a contour, (V,) bool.
-        shapes: from ARKit's 52 weights to the rig's, (N,52).
-        dense: vertices of the points of ``dense_points``, (P,).
-        brow_lift: how much higher brows lie than on the performer, millimetres.
-        draw: someone new.
-    """
-
-    faces: Tensor
-    material: Tensor
-    landmarks: Tensor
-    canonical: Tensor
-    marks: Tensor
-    outer: Tensor
-    shapes: Tensor
-    dense: Tensor
-    brow_lift: float
-    draw: Callable[[torch.Generator], DrawnHead]
+    faces: Tensor  # (F,3)
+    material: Tensor  # of each face, (F,)
+    landmarks: Tensor  # vertices of iBUG's 68, (68,)
+    canonical: Tensor  # each vertex on the performer's sculpture, (V,3)
+    marks: Tensor  # what skin is painted by, (V,8); see skin_texture
+    outer: Tensor  # vertices of the skin that can be a contour, (V,) bool
+    shapes: Tensor  # from ARKit's 52 weights to the rig's, (N,52)
+    dense: Tensor  # vertices of the points of dense_points, (P,)
+    brow_lift: float  # how much higher brows lie than on the performer, millimetres
+    draw: Callable[[torch.Generator], DrawnHead]  # someone new
 
 
 @lru_cache(maxsize=1)

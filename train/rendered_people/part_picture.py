@@ -32,17 +32,11 @@ _ROW = {name: number for number, name in enumerate(PARTS)}
 
 @dataclass(frozen=True, eq=False)
 class PartPicture:
-    """One picture.
+    """One picture."""
 
-    Args:
-        image: uint8 (3,S,S).
-        parts: of :data:`PARTS`, uint8 (S,S).
-        box: of the face, (4,) pixels.
-    """
-
-    image: Tensor
-    parts: Tensor
-    box: Tensor
+    image: Tensor  # uint8 (3,S,S)
+    parts: Tensor  # of PARTS, uint8 (S,S)
+    box: Tensor  # of the face, (4,) pixels
 
 
 def draw_part_pictures(

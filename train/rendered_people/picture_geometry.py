@@ -22,19 +22,12 @@ _BROW_X = (10.5, 21.0, 32.5, 43.0, 51.5)  # of a brow's five landmarks on the me
 
 @dataclass(frozen=True, eq=False)
 class Surface:
-    """All that a camera can see, as one mesh; the head's vertices and faces come first.
+    """All that a camera can see, as one mesh; the head's vertices and faces come first."""
 
-    Args:
-        vertices: (V,3), millimetres.
-        faces: (F,3).
-        material: of each face, (F,).
-        hair: share of hair at the head's vertices, (V',).
-    """
-
-    vertices: Tensor
-    faces: Tensor
-    material: Tensor
-    hair: Tensor
+    vertices: Tensor  # (V,3), millimetres
+    faces: Tensor  # (F,3)
+    material: Tensor  # of each face, (F,)
+    hair: Tensor  # share of hair at the head's vertices, (V',)
 
 
 def surface(kind: HeadKind, head: DrawnHead, posed: Tensor, looks: Looks, generator: torch.Generator) -> Surface:

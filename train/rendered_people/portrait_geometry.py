@@ -22,34 +22,21 @@ _BROW_EDGE = ((11.0, 20.5, 92.0), (22.0, 24.0, 90.0), (34.0, 26.0, 85.0), (44.5,
 
 @dataclass(frozen=True)
 class Hairdo:
-    """Hair of one person.
+    """Hair of one person."""
 
-    Args:
-        thickness: over the scalp, millimetres; 0 is shaved.
-        hairline: how far it has moved up, millimetres; negative falls over the forehead.
-        curtain: how far it hangs below the eyes, millimetres; 0 is short hair.
-        opening: half the angle that a curtain leaves free in front, degrees.
-    """
-
-    thickness: float
-    hairline: float
-    curtain: float
-    opening: float
+    thickness: float  # over the scalp, millimetres; 0 is shaved
+    hairline: float  # how far it has moved up, millimetres; negative falls over the forehead
+    curtain: float  # how far it hangs below the eyes, millimetres; 0 is short hair
+    opening: float  # half the angle that a curtain leaves free in front, degrees
 
 
 @dataclass(frozen=True, eq=False)
 class Portrait:
-    """A head with what belongs to it as one mesh.
+    """A head with what belongs to it as one mesh."""
 
-    Args:
-        vertices: (V,3), millimetres, the head's own first.
-        faces: (F,3), the head's own first.
-        part: of each face, (F,): 0 head, 1 curtain of hair, 2 teeth, 3 clothes.
-    """
-
-    vertices: Tensor
-    faces: Tensor
-    part: Tensor
+    vertices: Tensor  # (V,3), millimetres, the head's own first
+    faces: Tensor  # (F,3), the head's own first
+    part: Tensor  # of each face, (F,): 0 head, 1 curtain of hair, 2 teeth, 3 clothes
 
 
 def portrait(rest: Tensor, moved: Tensor, faces: Tensor, hairdo: Hairdo, generator: torch.Generator) -> Portrait:

@@ -55,17 +55,11 @@ class FaceImageSettings:
 
 @dataclass(frozen=True, eq=False)
 class FaceImage:
-    """An image and the truth about it.
+    """An image and the truth about it."""
 
-    Args:
-        image: grey, uint8 (H,W).
-        landmarks: iBUG's 68, (68,2) pixels, as an annotator sees them: see ``annotated_landmarks``.
-        box: x, y, width, height round the face as a detector draws it, (4,) pixels.
-    """
-
-    image: Tensor
-    landmarks: Tensor
-    box: Tensor
+    image: Tensor  # grey, uint8 (H,W)
+    landmarks: Tensor  # iBUG's 68, (68,2) pixels, as an annotator sees them: see annotated_landmarks
+    box: Tensor  # x, y, width, height round the face as a detector draws it, (4,) pixels
     person: int
 
 

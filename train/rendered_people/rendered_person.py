@@ -24,21 +24,13 @@ _FEW = 8  # pixels of eyeballs
 
 @dataclass(frozen=True, eq=False)
 class RenderedPerson:
-    """What a camera sees.
+    """What a camera sees."""
 
-    Args:
-        image: colours with a fourth channel that is 1 on the person, 0 on what is behind, (H,W,4) sRGB.
-        distance: (H,W) millimetres, infinite where there is nothing.
-        material: (H,W), -1 where there is nothing.
-        exposure: what the light was multiplied by.
-        hits: of the rays through the pixels, in rows from the top.
-    """
-
-    image: Tensor
-    distance: Tensor
-    material: Tensor
-    exposure: float
-    hits: Hits
+    image: Tensor  # colours with a fourth channel that is 1 on the person, 0 on what is behind, (H,W,4) sRGB
+    distance: Tensor  # (H,W) millimetres, infinite where there is nothing
+    material: Tensor  # (H,W), -1 where there is nothing
+    exposure: float  # what the light was multiplied by
+    hits: Hits  # of the rays through the pixels, in rows from the top
 
 
 def render_person(

@@ -71,17 +71,12 @@ class Scene:
 
 @dataclass(frozen=True, eq=False)
 class Film:
-    """A video on disk and the truth about it.
-
-    Args:
-        person: who it shows.
-        truth: of each frame; ``picture`` is empty.
-    """
+    """A video on disk and the truth about it."""
 
     path: Path
-    person: Person
+    person: Person  # who it shows
     performance: WebcamPerformance
-    truth: WebcamFrame
+    truth: WebcamFrame  # of each frame; picture is empty
 
     def frames(self) -> Tensor:
         """What the webcam sends, uint8 (T,3,H,W)."""

@@ -45,21 +45,13 @@ class SittingSettings:
 
 @dataclass(frozen=True, eq=False)
 class WebcamPerformance:
-    """Frames of someone before a webcam.
+    """Frames of someone before a webcam."""
 
-    Args:
-        fps: frames a second.
-        weights: of ARKit's shapes, (T,52) in [0,1].
-        rotation: from the head to the camera, (T,3,3).
-        translation: of the head's origin in the camera's coordinates, (T,3), millimetres.
-        hand: how far a hand has been raised to the mouth, (T,) in [0,1]; 0 where there is none.
-    """
-
-    fps: float
-    weights: Tensor
-    rotation: Tensor
-    translation: Tensor
-    hand: Tensor
+    fps: float  # frames a second
+    weights: Tensor  # of ARKit's shapes, (T,52) in [0,1]
+    rotation: Tensor  # from the head to the camera, (T,3,3)
+    translation: Tensor  # of the head's origin in the camera's coordinates, (T,3), millimetres
+    hand: Tensor  # how far a hand has been raised to the mouth, (T,) in [0,1]; 0 where there is none
 
     def __len__(self) -> int:
         return len(self.weights)

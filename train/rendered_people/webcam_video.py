@@ -60,21 +60,13 @@ class WebcamSettings:
 
 @dataclass(frozen=True, eq=False)
 class WebcamFrame:
-    """One frame; the person's right eye comes first.
+    """One frame; the person's right eye comes first."""
 
-    Args:
-        picture: uint8 (3,H,W), red first.
-        landmarks: iBUG's 68 as an annotator sees them, (68,2) pixels.
-        visible: which of them nothing hides and lie in the picture, (68,) bool.
-        iris: centres of the irises, (2,2) pixels.
-        present: whether there is a face to be seen, () bool.
-    """
-
-    picture: Tensor
-    landmarks: Tensor
-    visible: Tensor
-    iris: Tensor
-    present: Tensor
+    picture: Tensor  # uint8 (3,H,W), red first
+    landmarks: Tensor  # iBUG's 68 as an annotator sees them, (68,2) pixels
+    visible: Tensor  # which of them nothing hides and lie in the picture, (68,) bool
+    iris: Tensor  # centres of the irises, (2,2) pixels
+    present: Tensor  # whether there is a face to be seen, () bool
 
 
 def stacked(frames: list[WebcamFrame]) -> WebcamFrame:

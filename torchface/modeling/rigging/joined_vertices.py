@@ -17,19 +17,12 @@ _ALIKE = 0.2
 
 @dataclass(frozen=True, eq=False)
 class JoinedMesh:
-    """A mesh whose vertices in one place are one, unless they face apart.
+    """A mesh whose vertices in one place are one, unless they face apart."""
 
-    Args:
-        vertices: (J,3) float64.
-        faces: (F,3) of them.
-        of: the joined vertex of each of the mesh's, (V,).
-        part: connected part of each, (J,).
-    """
-
-    vertices: Tensor
-    faces: Tensor
-    of: Tensor
-    part: Tensor
+    vertices: Tensor  # (J,3) float64
+    faces: Tensor  # (F,3) of them
+    of: Tensor  # the joined vertex of each of the mesh's, (V,)
+    part: Tensor  # connected part of each, (J,)
 
 
 @dataclass(frozen=True, eq=False)

@@ -27,17 +27,11 @@ _SHELL, _CLEAR = 6.0, 0.2  # millimetres before an eye: where shells lie at most
 
 @dataclass(frozen=True, eq=False)
 class LooseParts:
-    """How a head moves with its loose parts.
+    """How a head moves with its loose parts."""
 
-    Args:
-        deltas: (N,J,3), millimetres.
-        bones: vertices of eyeballs and of what lies in the mouth, (J,) bool.
-        tongue: how much each vertex is of the tongue, (J,) in [0,1].
-    """
-
-    deltas: Tensor
-    bones: Tensor
-    tongue: Tensor
+    deltas: Tensor  # (N,J,3), millimetres
+    bones: Tensor  # vertices of eyeballs and of what lies in the mouth, (J,) bool
+    tongue: Tensor  # how much each vertex is of the tongue, (J,) in [0,1]
 
 
 def moved_parts(

@@ -45,17 +45,11 @@ _AT_LIPS = 1.5  # millimetres from the edge of lips that were cut
 
 @dataclass(frozen=True, eq=False)
 class TemplatePlaces:
-    """Vertices of a head that follow known places of the template.
+    """Vertices of a head that follow known places of the template."""
 
-    Args:
-        rows: of the head, (n,).
-        corner: two vertices of the template for each, (n,2).
-        share: how much of each, (n,2).
-    """
-
-    rows: Tensor
-    corner: Tensor
-    share: Tensor
+    rows: Tensor  # of the head, (n,)
+    corner: Tensor  # two vertices of the template for each, (n,2)
+    share: Tensor  # how much of each, (n,2)
 
     @staticmethod
     def at(rows: Tensor, ids: Tensor) -> "TemplatePlaces":
@@ -157,24 +151,15 @@ def fitted_template(template: BlendshapeRig, registration: Registration) -> Mesh
 
 @dataclass(frozen=True, eq=False)
 class _Skin:
-    """Where a head's vertices lie on the fitted template.
-
-    Args:
-        corner: template vertices around each place, (J,3).
-        share: of each corner, (J,3).
-        confidence: (J,).
-        distance: (J,), millimetres.
-        known: (J,) bool.
-        loose: vertices of parts that are no skin, (J,) bool.
-    """
+    """Where a head's vertices lie on the fitted template."""
 
     joined: JoinedMesh
-    corner: Tensor
-    share: Tensor
-    confidence: Tensor
-    distance: Tensor
-    known: Tensor
-    loose: Tensor
+    corner: Tensor  # template vertices around each place, (J,3)
+    share: Tensor  # of each corner, (J,3)
+    confidence: Tensor  # (J,)
+    distance: Tensor  # (J,), millimetres
+    known: Tensor  # (J,) bool
+    loose: Tensor  # vertices of parts that are no skin, (J,) bool
 
     @staticmethod
     def of(
