@@ -31,7 +31,7 @@ from torchface.cli.relight import relight
 from torchface.cli.render import render
 from torchface.cli.retarget import retarget
 from torchface.cli.retime import retime
-from torchface.cli.rig import rig
+from torchface.cli.rig_command import rig
 from torchface.cli.solve import solve
 from torchface.cli.terminal import PlainConsole, count_interrupts_once, plain_errors, print_lines
 from torchface.cli.track import track
