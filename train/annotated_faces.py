@@ -81,8 +81,7 @@ def annotated_landmarks(path: Path) -> list[tuple[Path, Tensor]]:
 def load_faces(path: Path, folders_are_people: bool = False) -> Faces:
     """The annotated faces of a folder of ``.pts`` files or of a dlib ``.xml``; those without all 68 are left out.
 
-    Args:
-        folders_are_people: pictures of a folder show one person; else each shows its own, a mirrored copy the same.
+    A mirrored copy shows the same person; so do all pictures of a folder, if ``folders_are_people``.
     """
     found = annotated_landmarks(path)
     known: dict[Path, Tensor] = {}

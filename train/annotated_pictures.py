@@ -26,9 +26,6 @@ def annotated_pictures(path: Path, network: LandmarkNetwork) -> tuple[TensorData
 
     What an annotation does not say, further points of the face and its expression, is what the network reads before:
     so it keeps them while it learns the 68.
-
-    Args:
-        path: a folder of pictures with ``.pts`` files of the same names, or a dlib ``.xml``.
     """
     rows = [_picture(image, landmarks, network) for image, landmarks in annotated_landmarks(path)]
     if len(rows) < 2:

@@ -173,15 +173,8 @@ def performed(vertices: int, seed: int, fps: float) -> Capture:
 
 
 def gather(capture: Capture, path: Path, progress: Progress, colors: bool = False) -> tuple[MeshSequence, Tensor]:
-    """Writes all frames, or their colours, into one file; where an earlier run has stopped, it goes on.
-
-    Args:
-        progress: called with each step and how far it is.
-        colors: of the vertices, in place of their positions; all sequences have some.
-
-    Returns:
-        The frames, and the number of each frame's sequence, (K,) int64.
-    """
+    """Writes all frames, or their colours, which all sequences have, into one file, and the number of each frame's
+    sequence, (K,) int64; where an earlier run has stopped, it goes on."""
     counts = torch.tensor([sequence.count for sequence in capture.sequences])
     numbers = torch.arange(len(counts)).repeat_interleave(counts)
     key = f"{capture.key} colors" if colors else capture.key

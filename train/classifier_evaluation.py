@@ -34,16 +34,9 @@ def cross_validation(
     """The fraction of frames in the right class of unit and intensity, by group of regions.
 
     Args:
-        videos: as for :meth:`ActionUnitClassifier.fit`.
-        labels: of each.
-        groups: which regions show which units.
-        settings: of the training; frames are not warped.
         folds: into how many parts the frames are split; each is left out once.
         split: ``frames`` draws frames at random, as is usual; ``repetitions`` leaves whole repetitions out, so that no
             frame is tested with its neighbours; ``performers`` whole videos, so that none is tested with their own.
-
-    Returns:
-        Accuracy by name of the group.
     """
     check_training(videos, labels, groups)
     names = group_regions(groups)

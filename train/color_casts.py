@@ -72,13 +72,6 @@ def color_casts(colors: Tensor, weights: Tensor | None = None) -> Tensor:
 def without_cast(colors: Tensor, cast: Tensor) -> Tensor:
     """Colours as the scans' common light would show them.
 
-    Args:
-        colors: sRGB in [0,1], (M,V,3).
-        cast: of :func:`color_casts`, (M,3).
-
-    Returns:
-        sRGB, (M,V,3), within [0,1].
-
     Example:
         >>> skin = torch.full((1, 50, 3), 0.5)
         >>> scans = torch.cat([skin, skin * torch.tensor([1.2, 1.0, 1.0])])

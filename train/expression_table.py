@@ -79,13 +79,6 @@ def compare(
 
     Of more than a hundred people the last fifty are predicted, all from the others.
 
-    Args:
-        people: three at least.
-        fit: learns from those who are left.
-        template: whose shapes are transferred; the mean of those who are left, if absent.
-        keep: for how many people, the first, predictions are kept for pictures.
-        progress: called with each step and how far it is.
-
     Source: thesis 3.3.4, table 1.
     """
     progress = progress or silent

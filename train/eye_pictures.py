@@ -44,12 +44,8 @@ class EyePictures:
 
 
 class StoredEyePictures(Dataset[tuple[Tensor, ...]]):
-    """Pictures of files, of which none is in memory but those that are asked for.
-
-    Args:
-        paths: of the files, in their order.
-        begin, end: which of the pictures; all to the last if ``end`` is absent.
-    """
+    """Pictures ``begin`` to ``end`` of files, in their order, of which none is in memory but those that are asked
+    for."""
 
     def __init__(self, paths: Sequence[Path], begin: int = 0, end: int | None = None) -> None:
         self._shards = Shards(paths, [field.name for field in fields(EyePictures)])

@@ -127,12 +127,7 @@ def evaluate(
 def mined_pieces(
     model: BoxNetwork, count: int, size: int, seed: int, progress: Progress | None = None
 ) -> list[np.ndarray]:
-    """Squares (S,S,3) round what a network takes for faces in pictures without people.
-
-    Args:
-        size: pixels a side of the squares, S.
-        progress: called with each step and how far it is.
-    """
+    """Squares (S,S,3) round what a network takes for faces in pictures without people."""
     progress, detector = progress or silent, NetworkDetector(model, _MISTAKEN)
     pieces: list[np.ndarray] = []
     for number in range(count):  # pictures have different numbers of mistakes

@@ -31,12 +31,8 @@ _PEOPLE = 0.5  # of the pictures show ICT-FaceKit's heads, where there are some
 
 
 class StoredPictures(Dataset[tuple[Tensor, ...]]):
-    """Pictures of files, of which none is in memory but those that are asked for.
-
-    Args:
-        paths: of the files, in their order.
-        count: how many of the pictures, the first; all if absent.
-    """
+    """The first ``count`` pictures, or all, of files, in their order; in memory are none but those that are asked
+    for."""
 
     def __init__(self, paths: Sequence[Path], count: int | None = None) -> None:
         right = [(torch.uint8, (4,)), (torch.float32, (68, 2)), (torch.bool, (68,))]
@@ -53,11 +49,7 @@ class StoredPictures(Dataset[tuple[Tensor, ...]]):
 
 
 class StoredExpressions(StoredPictures):
-    """The same pictures with points of the surface, which are visible, and weights beside.
-
-    Args:
-        paths, count: as of :class:`StoredPictures`.
-    """
+    """The same pictures with points of the surface, which are visible, and weights beside."""
 
     def __init__(self, paths: Sequence[Path], count: int | None = None) -> None:
         super().__init__(paths, count)
@@ -76,12 +68,8 @@ def _shards(paths: Sequence[Path], right: Mapping[str, tuple[torch.dtype, tuple[
 
 
 class StoredCutOuts:
-    """People to put into scenes, of files: their landmarks are in memory, of their pictures the one that is asked for.
-
-    Args:
-        paths: of the files, in their order.
-        begin, end: which of the pictures; all to the last if ``end`` is absent.
-    """
+    """People to put into scenes, ``begin`` to ``end`` of files: their landmarks are in memory, of their pictures the
+    one that is asked for."""
 
     def __init__(self, paths: Sequence[Path], begin: int = 0, end: int | None = None) -> None:
         self._pictures, self._begin = StoredPictures(paths), begin

@@ -41,10 +41,7 @@ def generalised_procrustes(
 
     Args:
         shapes: (M,V,3), millimetres; read in blocks.
-        scale: estimate :math:`s`; otherwise sizes stay, and differ.
-        weights: of the vertices, (V,); equal if absent.
         initial_mean: where the mean is to lie, (V,3); where the first shape lies if absent.
-        progress: called with each step and how far it is.
 
     Source: Gower 1975; thesis 3.2.4.
     """

@@ -34,14 +34,7 @@ def draw(
     test: Samples | None,
     progress: Progress,
 ) -> None:
-    """Writes the pictures into a folder.
-
-    Args:
-        folder: made where it is missing.
-        quality: its curves, if it was measured.
-        learn, test: the heads that it has learned from and others, where there are any.
-        progress: called with each step and how far it is.
-    """
+    """Writes the pictures of the heads learned from and of others, and of the quality measured, into a folder."""
     make_folder(folder)
     known, others = (
         torch.cat([model.shape.project(part.read(*block)) for block in blocks(part)])
@@ -131,13 +124,7 @@ def quality_figure(quality: ModelQuality) -> Tensor:
 
 
 def scatter_figure(model: MorphableModel, coefficients: Tensor, held_out: Tensor | None = None) -> Tensor:
-    """Samples along the first three components, two at a time (figure 24).
-
-    Args:
-        model: that they are coefficients of.
-        coefficients: of the training samples, (M,K).
-        held_out: of others, (L,K).
-    """
+    """Training samples (M,K) and others (L,K) along the first three components, two at a time (figure 24)."""
     figure = Figure(figsize=(12, 4.2), dpi=100, layout="constrained")
     explained = model.standard_deviations.double().square() / model.total_variance.double()
     count = model.count

@@ -78,12 +78,9 @@ def registered(folder: Path, unit: str | None = None) -> Source:
 
 
 def gather(source: Source, held_out: int, work: Path, template: Mesh | None, progress: Progress) -> Gathered:
-    """Writes all meshes into two files; where an earlier run has stopped, it goes on.
+    """Writes all meshes, the last kept for the test, into two files; where an earlier run has stopped, it goes on.
 
-    Args:
-        held_out: how many of them, the last, are kept for the test.
-        template: of the same topology; says where the heads are to stand. The first mesh, upright, if absent.
-        progress: called with each step and how far it is.
+    The template says where the heads are to stand; the first mesh, upright, if absent.
     """
     first = source.read(0)
     name = source.names[0] if template is None else "template"

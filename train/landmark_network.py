@@ -66,12 +66,7 @@ class Settings(RenderedSettings):
 
 @recipe
 def train(settings: Settings, run: Run) -> LandmarkNetwork:
-    """Renders, trains, calibrates, evaluates and saves.
-
-    Raises:
-        ValueRangeError: fewer pictures than are held out and a part more, or a share that none has.
-        NameMismatchError: ``start`` is no landmark network.
-    """
+    """Renders, trains, calibrates, evaluates and saves."""
     progress = run.progress
     if settings.data is not None:
         return fine_tuned(settings, settings.data, run)
@@ -93,12 +88,7 @@ def train(settings: Settings, run: Run) -> LandmarkNetwork:
 
 
 def fine_tuned(settings: Settings, data: Path, run: Run) -> LandmarkNetwork:
-    """A network that has gone on learning from annotated photographs, measured before and after, and saved.
-
-    Raises:
-        FileFormatError, ValueRangeError: see :func:`annotated_pictures`.
-        NameMismatchError: ``start`` is no landmark network.
-    """
+    """A network that has gone on learning from annotated photographs, measured before and after, and saved."""
     name = _ZOO if settings.start in (None, "zoo") else str(settings.start)
     model = zoo.get_model(name, LandmarkNetwork)
     run.progress("reading annotated pictures")

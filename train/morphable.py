@@ -217,13 +217,8 @@ def _source(settings: Settings) -> tuple[Source, int]:
 
 
 def ict_head_model(folder: Path, part: str | None = None, components: int | None = None) -> HeadModel:
-    """ICT-FaceKit's identity modes as a head model that carries its expressions.
-
-    Args:
-        folder: ``FaceXModel``.
-        part: a region to keep, such as ``"face"``.
-        components: how many modes; all that the folder has if absent.
-    """
+    """The identity modes, all or some, of ICT-FaceKit's ``FaceXModel`` as a head model, or a part of it, with its
+    expressions."""
     rig, modes = load_ict_facekit(folder), load_identity_modes(folder, components).deltas
     deviations = modes.flatten(1).norm(dim=1)
     shape = MorphableModel(rig.vertices, modes / deviations[:, None, None], deviations)

@@ -110,13 +110,8 @@ _ANTAGONISTS = (
 
 
 def converse(frames: int, generator: torch.Generator, fps: float = 60.0) -> Take:
-    """A take of a person who talks, listens and feels: names are ARKit's 52, values (T,52,1) in [0,1].
-
-    Args:
-        frames: how many, T.
-        generator: where the randomness comes from; each take is another person.
-        fps: frames a second.
-    """
+    """A take of another person each time, who talks, listens and feels: names are ARKit's 52, values (T,52,1) in
+    [0,1]."""
     draw = _Draws(generator, frames / fps)
     seconds = torch.arange(frames) / fps
     units = _speech(seconds, draw)

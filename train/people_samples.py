@@ -120,14 +120,7 @@ def gather(
     where: str,
     progress: Progress,
 ) -> People:
-    """Writes all people, a file each; those that an earlier run has written are not read again.
-
-    Args:
-        read: gives the rig of a number.
-        key: of what that rig is made of.
-        where: the people are from, for messages.
-        progress: called with each step and how far it is.
-    """
+    """Writes all people, a file each; those that an earlier run has written of the same ``key`` are not read again."""
     make_folder(work)
     first = read(0)
     topology = first.neutral.fingerprint()

@@ -59,15 +59,10 @@ def read_takes(
     attachment: Attachment | None = None,
     progress: Progress | None = None,
 ) -> PriorTakes:
-    """All takes of a folder, by name; one is in memory at a time.
+    """All takes of a folder, or of one for each person, by name; one is in memory at a time, the weights are kept in
+    ``work``.
 
-    Args:
-        folder: with .csv, .c3d and .trc files, or with a folder of such files for each person.
-        work: folder that keeps their weights, a file a take; those of an earlier run are taken up.
-        fps: frame rate to bring all takes to; that of the first if absent.
-        rig: of the performer of marker takes.
-        attachment: where the markers sit on the rig.
-        progress: called with each step and how far it is.
+    They are brought to ``fps``, else to the first one's; marker takes are of the rig and the attachment.
     """
     progress = progress or silent
     if not folder.is_dir():

@@ -68,16 +68,9 @@ class SyntheticVideo:
 def synthetic_video(
     rig: BlendshapeRig, names: Sequence[str], takes: Sequence[Tensor], pixel_noise: float, frames: int, seed: int = 0
 ) -> SyntheticVideo | None:
-    """Takes on a rig whose head nods and turns before a camera of 640 by 480 pixels.
+    """Takes (T,N) on a rig whose head nods and turns before a camera of 640 by 480 pixels, so many frames of each.
 
-    Args:
-        rig: whose landmarks are seen; its shapes need not have the takes' names.
-        takes: weights, (T,N).
-        pixel_noise: standard deviation of a landmark's coordinate.
-        frames: how many of each take, evenly spread.
-
-    Returns:
-        None where the rig has no landmarks, or fewer than half of the shapes.
+    None where the rig has no landmarks, or fewer than half of the shapes.
     """
     annotations = rig.neutral.annotations
     landmarks = None if annotations is None else annotations.landmarks

@@ -29,11 +29,7 @@ class Settings(PriorSettings):
 
 @recipe
 def train(settings: Settings, run: Run) -> dict[str, dict[str, float]]:
-    """Loads, names, splits, chooses, fits, evaluates, saves, draws.
-
-    Returns:
-        What was measured, by the folder's name.
-    """
+    """Loads, names, splits, chooses, fits, evaluates, saves, draws; what was measured, by the folder's name."""
     _check_one_source(settings)
     material = _material(settings, run.work, run.progress)
     measured = {}

@@ -35,19 +35,11 @@ class Rendering:
 def rendered_files(
     rendering: Rendering, folder: Path, count: int, seed: int, ict: Path | None, workers: int, progress: Progress | None
 ) -> list[Path]:
-    """Renders what a folder does not hold yet; how many processes render does not change the pictures.
+    """Renders what a folder does not hold yet, and gives the files; how many processes render does not change the
+    pictures.
 
-    A file that cannot be read, or has more or fewer pictures, is named in a warning and rendered again.
-
-    Args:
-        folder: for the files; pictures of another seed or other heads lie beside each other there.
-        count: of pictures, rounded up to whole files.
-        ict: ICT-FaceKit's ``FaceXModel``, whose heads are shown too; embedded performers alone without.
-        workers: processes.
-        progress: called with each step and how far it is.
-
-    Returns:
-        The files, in order.
+    A file that cannot be read, or has more or fewer pictures, is named in a warning and rendered again. Pictures of
+    another seed or other heads lie beside each other; ``count`` is rounded up to whole files.
     """
     progress = progress or silent
     make_folder(folder)

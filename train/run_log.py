@@ -34,10 +34,6 @@ class RunLog:
 
     A run that goes on from a checkpoint takes up the table of the one before: rows of the steps that it does again are
     replaced, and its clock goes on.
-
-    Args:
-        folder: of the files; made with the first value.
-        goes_on: whether there is a run to take up.
     """
 
     def __init__(self, folder: Path, goes_on: bool = False) -> None:

@@ -113,11 +113,7 @@ class Recipe(Generic[Settings, Trained]):
         plain_options(self.settings)
 
     def main(self, arguments: Sequence[str] | None = None) -> None:
-        """Parses flags, trains, prints; a mistake of the user ends it with one line and status 2.
-
-        Args:
-            arguments: words of the command line; those of this process if absent.
-        """
+        """Parses flags, trains, prints; a mistake of the user ends it with one line and status 2."""
         with plain_errors():
             chosen = self.chosen(list(sys.argv[1:] if arguments is None else arguments))
             kept = inputs_kept(self.settings, vars(chosen))

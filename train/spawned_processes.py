@@ -17,11 +17,6 @@ def map_in_processes(work: Callable[[Part], Result], parts: Sequence[Part], work
     """The results of all parts, in their order; with one worker they are made in this process.
 
     The processes end with this one, however it ends.
-
-    Args:
-        work: a function of a module, so that processes can import it.
-        parts: what it is given, one at a time.
-        workers: processes.
     """
     if workers <= 1 or not parts:
         yield from map(work, parts)

@@ -72,11 +72,8 @@ class TakesOnDisk(Sequence[Tensor]):
 
 
 class TakeStore:
-    """Writes takes one after the other; those that an earlier run has written of the same are read instead.
-
-    Args:
-        folder: for the files.
-    """
+    """Writes takes one after the other into a folder; those that an earlier run has written of the same are read
+    instead."""
 
     def __init__(self, folder: Path, count: int) -> None:
         make_folder(folder)

@@ -19,10 +19,6 @@ class Shards:
 
     Only the files' headers are read beforehand. Every read opens a file anew: pages of a mapping that is closed leave
     the memory.
-
-    Args:
-        paths: of the files, in the order of the rows; at least one.
-        names: of the tensors, of as many rows each, one at least, in every file.
     """
 
     def __init__(self, paths: Sequence[Path], names: Sequence[str]) -> None:

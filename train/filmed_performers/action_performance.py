@@ -57,13 +57,7 @@ class ActionPerformance:
 def perform_action_units(
     names: Sequence[str], generator: torch.Generator, settings: PerformanceSettings = PerformanceSettings()
 ) -> ActionPerformance:
-    """A session: first every unit alone, then the combinations, in an order drawn anew, after a second of rest.
-
-    Args:
-        names: of the rig's shapes, N; those of ``MOVES`` must be among them.
-        generator: where timing, strength and the performer's habits come from.
-        settings: how the session runs.
-    """
+    """A session: first every unit alone, then the combinations, in an order drawn anew, after a second of rest."""
     names = tuple(names)
 
     def uniform(low: float, high: float) -> float:

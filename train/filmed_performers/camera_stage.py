@@ -87,15 +87,7 @@ def record_session(
     progress: Progress | None = None,
     attachment: Attachment | None = None,
 ) -> RecordedSession:
-    """Paints a performer, sets markers, records a session: ``name.avi``, ``name.c3d`` and ``name.toml``.
-
-    Args:
-        identity: of the performer, (K,); the mean if absent.
-        generator: where all randomness comes from.
-        settings: how.
-        progress: called with each step and how far it is.
-        attachment: of the markers, those on the sides of the face among them; ``stage_markers`` if absent.
-    """
+    """Paints a performer, sets markers, records a session: ``name.avi``, ``name.c3d`` and ``name.toml``."""
     folder = Path(folder)
     rig = performer(identity, texture=True)
     performance = perform_action_units(rig.names, generator, settings.performance)
@@ -129,12 +121,7 @@ def _counted(frames: Iterator[Tensor], total: int, progress: Progress) -> Iterat
 
 
 def stage_markers(rig: BlendshapeRig, count: int = 40) -> Attachment:
-    """Markers spread over the performer's skin, and one on each side of the face where it moves least.
-
-    Args:
-        rig: a performer of :func:`torchface.synthetic.head.performer`.
-        count: how many besides the two.
-    """
+    """So many markers spread over the performer's skin, and one on each side of the face where it moves least."""
     spots = place_markers(rig, count)
     p = sculpted_vertices()
     aside = torch.tensor([60.0, -4.0, 44.0], dtype=p.dtype)
@@ -204,12 +191,6 @@ def render_video(
     """Grey images (H,W) in [0,1] of a painted performer, one a frame.
 
     The light sits round the lens: skin scatters it, paint throws much of it back, markers all of it.
-
-    Args:
-        scene: the performer with skin, paint and markers.
-        weights: (T,N).
-        camera: intrinsics and size.
-        rotation, translation: world to camera in each frame, (T,3,3) and (T,3).
     """
     _, ways = replace(camera, rotation=torch.eye(3), translation=torch.zeros(3)).rays()
     shape = ways.shape[:2]

@@ -18,11 +18,7 @@ _DISTANCE = 230.0  # at which a surface is as bright as its grey says, millimetr
 
 
 class HeadCameraRenderer:
-    """Front of the head, helmet plates and marker balls as one mesh that moves.
-
-    Args:
-        paint: share of paint on its skin texture, (size,size).
-    """
+    """Front of the head, with paint (size,size), helmet plates and marker balls as one mesh that moves."""
 
     def __init__(self, rig: BlendshapeRig, paint: Tensor, attachment: Attachment) -> None:
         mesh = rig.neutral

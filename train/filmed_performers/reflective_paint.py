@@ -35,11 +35,6 @@ def reflective_paint(size: int = 1024, generator: torch.Generator | None = None,
 
     Strokes over the inner and the outer brows, between the brows and down the nose's root, dashes on the upper and the
     lower lids and round the lips.
-
-    Args:
-        size: pixels a side.
-        generator: of the painter's hand; without it every stroke lies where it should.
-        unsteadiness: how far strokes lie off, standard deviation in millimetres.
     """
     texels, values = _painted_texels(size)
     points = values[:, :3]

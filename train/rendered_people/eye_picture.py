@@ -52,12 +52,10 @@ class EyePicture:
 def draw_eye_pictures(
     kinds: Sequence[HeadKind], shares: Sequence[float], first: int, count: int, seed: int, each: int = 5
 ) -> list[EyePicture]:
-    """Pictures by number, each of a person's eyes with lids, a gaze, a pose and lights drawn for it.
+    """Pictures by number, each of a person's eyes with lids, a gaze, a pose and lights drawn for it, ``each`` of one
+    person.
 
-    Args:
-        shares: how often each kind is drawn.
-        first, count: numbers of the pictures; a picture depends on its number and the seed alone.
-        each: pictures of one person.
+    A picture depends on its number, from ``first`` on, and the seed alone; ``shares`` say how often a kind is drawn.
     """
     parts = [_eye_kind(id(kind), kind) for kind in kinds]
     pictures: list[EyePicture] = []

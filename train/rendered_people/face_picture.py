@@ -44,13 +44,8 @@ class FacePicture:
 def draw_pictures(
     kinds: Sequence[HeadKind], shares: Sequence[float], first: int, count: int, seed: int, each: int = 4
 ) -> list[FacePicture]:
-    """Pictures by number, each of a person, an expression, a pose and lights drawn for it.
-
-    Args:
-        shares: how often each kind is drawn.
-        first, count: numbers of the pictures; a picture depends on its number and the seed alone.
-        each: pictures of one person.
-    """
+    """Pictures by number, each of a person, an expression, a pose and lights drawn for it, as
+    :func:`draw_eye_pictures`."""
     pictures: list[FacePicture] = []
     someone: Person | None = None
     for number in range(first, first + count):  # each has a surface of its own

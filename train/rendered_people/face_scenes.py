@@ -132,10 +132,6 @@ def face_scene(
 
     People stand before each other, the larger in front; they are mirrored, turned, cut by the border, hidden by hands,
     bars and things. Then the picture is taken: light, colour, blur, noise, compression.
-
-    Args:
-        number: of the picture, from 0.
-        seed: decides everything, with the number.
     """
     settings = settings or SceneSettings()
     block, place = divmod(number, _SCENES * _VIEWS)

@@ -97,12 +97,7 @@ def performer_kind() -> HeadKind:
 
 
 def people_kind(rig: BlendshapeRig, modes: IdentityModes) -> HeadKind:
-    """ICT-FaceKit's heads: identity modes of people and their expressions.
-
-    Args:
-        rig: the whole head with its expressions.
-        modes: of identity, of the same topology.
-    """
+    """ICT-FaceKit's heads: identity modes of people and the expressions of the whole head."""
     notes = rig.neutral.annotations
     if notes is None or notes.landmarks is None or "eyeball_left" not in notes.regions:
         raise ShapeError("rig: found no 68 landmarks with parts, expected ICT-FaceKit's whole head")

@@ -23,17 +23,9 @@ def with_lashes(
     dense: bool,
     generator: torch.Generator,
 ) -> Tensor:
-    """Lashes over an image.
+    """Lashes of a tone, sRGB (3,), that show, or hardly, over an image (H,W,4) whose fourth channel is 1 on the person.
 
-    Args:
-        image: colours with a fourth channel that is 1 on the person, (H,W,4).
-        distance: of what each pixel shows, (H,W) millimetres.
-        marks: iBUG's 68 on the head, (68,3) millimetres.
-        tone: of the lashes, sRGB (3,).
-        dense: lashes that show, or hardly.
-
-    Returns:
-        (H,W,4).
+    ``distance`` is of what each pixel shows, (H,W), ``marks`` are iBUG's 68 on the head, (68,3), millimetres.
     """
     strength = uniform(0.35, 0.9, generator) if dense else uniform(0.05, 0.5, generator)
     length = uniform(6.0, 10.0, generator) if dense else uniform(4.0, 7.5, generator)

@@ -42,12 +42,10 @@ class PartPicture:
 def draw_part_pictures(
     kinds: Sequence[HeadKind], shares: Sequence[float], first: int, count: int, seed: int, each: int, scenes: int
 ) -> list[PartPicture]:
-    """Pictures by number: of each person ``each`` are rendered, each is shown in ``scenes`` surroundings.
+    """Pictures by number, as :func:`draw_pictures`: of each person ``each`` are rendered, each is shown in ``scenes``
+    surroundings.
 
-    Args:
-        shares: how often each kind is drawn.
-        first, count: numbers of the pictures; a picture depends on its number and the seed alone.
-        each, scenes: see above; ``first`` and ``count`` are multiples of ``scenes``.
+    ``first`` and ``count`` are multiples of ``scenes``.
     """
     pictures: list[PartPicture] = []
     for number in range(first // scenes, (first + count) // scenes):  # each has a surface of its own

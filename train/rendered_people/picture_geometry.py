@@ -61,12 +61,8 @@ def _piece(vertices: Tensor, faces: Tensor, material: int) -> tuple[Tensor, Tens
 
 
 def annotated(kind: HeadKind, pixels: Tensor, looks: Looks) -> Tensor:
-    """The 68 landmarks (68,2) as an annotator sees them: brows along their upper edge, the jaw where the face ends.
-
-    Args:
-        pixels: where a camera sees its vertices, (V,2).
-        looks: of the person, whose brows lie higher or lower.
-    """
+    """The 68 landmarks (68,2) as an annotator sees them: brows, lower or higher as looks say, along their upper
+    edge, the jaw where the face ends; of pixels (V,2)."""
     seen = as_annotated(pixels[kind.landmarks])
     rows, weights = _brow_spots(kind, looks)
     seen[17:27] = (pixels[rows] * weights[..., None].to(pixels)).sum(1)

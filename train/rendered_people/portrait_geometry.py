@@ -40,12 +40,7 @@ class Portrait:
 
 
 def portrait(rest: Tensor, moved: Tensor, faces: Tensor, hairdo: Hairdo, generator: torch.Generator) -> Portrait:
-    """Puts hair, teeth and shoulders on a head.
-
-    Args:
-        rest, moved: the head at rest and with its expression, (V,3).
-        faces: of the head, (F,3).
-    """
+    """Puts hair, teeth and shoulders on a head, (V,3) at rest and with its expression."""
     rest, moved = rest.double(), moved.double()
     share = hair_share(hairdo.hairline)
     uneven = lumps(rest, generator)
@@ -178,11 +173,6 @@ def contour_lines(p: Tensor, marks: Tensor, skin: Tensor) -> tuple[Tensor, ...]:
     """For each of the jaw's 17 landmarks the vertices from it toward the face's middle, the landmark first.
 
     They lie in the plane through the landmark that holds the viewing axis and the line to the face's middle.
-
-    Args:
-        p: the vertices of a head, in place of the performer's, (V,3).
-        marks: its 68 landmark vertices.
-        skin: which vertices are its outer skin, (V,) bool.
     """
     lines = []
     for row in range(17):
@@ -208,12 +198,9 @@ def _brow_edge() -> tuple[Tensor, Tensor]:
 
 
 def annotated_landmarks(pixels: Tensor) -> Tensor:
-    """The 68 landmarks (68,2) as an annotator sees them.
+    """The 68 landmarks (68,2) of a head's vertices (V,2), pixels, as an annotator sees them.
 
     Brows are marked along their upper edge, and where cheeks hide the jaw's line, the cheeks' outline is.
-
-    Args:
-        pixels: where a camera sees the head's vertices, (V,2).
     """
     marks = _marks()
     seen = pixels[marks].clone()
@@ -223,13 +210,8 @@ def annotated_landmarks(pixels: Tensor) -> Tensor:
 
 
 def with_visible_jaw(seen: Tensor, pixels: Tensor, lines: tuple[Tensor, ...]) -> Tensor:
-    """Landmarks (68,2) with the jaw's where the face ends: where cheeks hide its line, the cheeks' outline is.
-
-    Args:
-        seen: the 68, pixels.
-        pixels: where a camera sees the head's vertices, (V,2).
-        lines: see ``contour_lines``.
-    """
+    """Landmarks (68,2) with the jaw's where the face, of vertices (V,2), ends: where cheeks hide its line, the
+    cheeks' outline is; by ``contour_lines``."""
     seen, middle = seen.clone(), seen[27:36].mean(0)
     for row, line in enumerate(lines):  # lines differ in length
         way = torch.nn.functional.normalize(seen[row] - middle, dim=0)

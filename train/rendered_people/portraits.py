@@ -83,14 +83,9 @@ class _Person:
 def face_images(
     count: int, seed: int, settings: FaceImageSettings | None = None, progress: Progress | None = None, first: int = 0
 ) -> Iterator[FaceImage]:
-    """Draws people, poses, expressions, lights and backgrounds, one image at a time.
+    """Draws people, poses, expressions, lights and backgrounds, one image at a time, from number ``first`` on.
 
-    Args:
-        count: how many images.
-        seed: decides them; an image does not depend on how many are asked for.
-        settings: what is drawn how widely.
-        progress: called with each step and how far it is.
-        first: number of the first image; several calls make what one would.
+    An image depends on its number and the seed, not on how many are asked for.
     """
     progress = progress or silent
     settings = settings or FaceImageSettings()

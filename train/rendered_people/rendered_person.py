@@ -82,11 +82,8 @@ def render_person(
 
 
 def _finer_rays(caster: RayCaster, camera: Camera, materials: Tensor) -> tuple[Tensor, Hits, Tensor]:
-    """Four rays more through each pixel of eyes and mouths and of their edges, where what is seen is small.
-
-    Returns:
-        The pixels' numbers (N,), what the rays hit, their directions (N,3).
-    """
+    """The pixels (N,) of four rays more through each pixel of eyes and mouths and of their edges, where what is seen
+    is small, what they hit, and their directions (N,3)."""
     small = (materials >= TEETH) & (materials <= SOCKET)
     small = torch.nn.functional.max_pool2d(small.float()[None, None], 3, 1, 1)[0, 0] > 0
     pixels = (small & (materials >= 0)).flatten().nonzero()[:, 0]
@@ -225,14 +222,8 @@ def _smooth(values: Tensor, seen: Tensor) -> Tensor:
 
 
 def visible_points(distance: Tensor, camera: Camera, points: Tensor, pixels: Tensor, behind: Tensor | float) -> Tensor:
-    """Which points of a head nothing stands before, (N,) bool.
-
-    Args:
-        distance: of what each pixel shows, (H,W) millimetres.
-        points: (N,3) millimetres.
-        pixels: where they are drawn, (N,2); it need not be where they are.
-        behind: how far each may lie behind what is seen, (N,) millimetres.
-    """
+    """Which points (N,3) of a head, drawn at pixels (N,2), nothing at a distance (H,W) stands before, (N,) bool, but
+    what lies at most ``behind``, (N,) millimetres, less far."""
     depth = (points - camera.centre).norm(dim=1)
     x, y = pixels[:, 0].round().long(), pixels[:, 1].round().long()
     x, y = x.clamp(0, camera.width - 1), y.clamp(0, camera.height - 1)
@@ -245,14 +236,8 @@ def visible_points(distance: Tensor, camera: Camera, points: Tensor, pixels: Ten
 def openness(
     caster: RayCaster, starts: Tensor, normals: Tensor, generator: torch.Generator, count: int, reach: float
 ) -> Tensor:
-    """The share of the hemisphere over each point that is free within reach, by a few rays a point, (R,) float64.
-
-    Args:
-        caster: of what may be in the way.
-        starts, normals: of the points, a little above the surface, (R,3).
-        count: rays a point.
-        reach: millimetres.
-    """
+    """The share of the hemisphere over points (R,3), a little above the surface, that is free within reach, by
+    ``count`` rays a point, (R,) float64."""
     free = torch.zeros(len(starts))
     for _ in range(count):  # a ray of each point a turn
         way = normals + torch.nn.functional.normalize(torch.randn(normals.shape, generator=generator).double(), dim=-1)

@@ -46,14 +46,9 @@ def clutter(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
 def draw_hand(
     image: np.ndarray, middle: np.ndarray, size: float, rng: np.random.Generator, turn: float | None = None
 ) -> None:
-    """A hand with its arm, as long as ``size`` pixels without it, somewhere on ``middle``; painted into the image.
+    """A hand with its arm, as long as ``size`` pixels without it, at ``middle``, painted into an image uint8 (H,W,3).
 
-    Args:
-        image: uint8 (H,W,3).
-        middle: where, (2,) pixels.
-        size: pixels.
-        rng: of its colour and form.
-        turn: radians by which the fingers' direction is turned clockwise from pointing right; any if absent.
+    Fingers point right, turned clockwise by ``turn`` radians, or anywhere.
     """
     skin = np.array(random_color(rng, 1.0))
     turn = rng.uniform(0, 2 * np.pi) if turn is None else turn

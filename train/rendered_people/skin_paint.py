@@ -16,14 +16,8 @@ _DEEP = (0.10, 0.035, 0.035)
 
 
 def surface_color(points: Tensor, marks: Tensor, material: Tensor, looks: Looks, brow_lift: float) -> Tensor:
-    """sRGB colours (R,3) of points of a head.
-
-    Args:
-        points: on the performer's sculpture, (R,3), millimetres.
-        marks: see ``skin_texture.vertex_marks``, (R,8).
-        material: of the triangles that they lie on, (R,).
-        brow_lift: see ``HeadKind``.
-    """
+    """sRGB colours (R,3) of points on the performer's sculpture, (R,3), millimetres, with marks (R,8) and a material
+    (R,)."""
     points = points.float()
     color = _skin(points, marks, looks, brow_lift)
     teeth = torch.tensor([0.88, 0.84, 0.76]) * (0.75 + 0.35 * ((looks.seed % 97) / 97))

@@ -18,17 +18,8 @@ def with_glasses(
     form: tuple[float, float, float, float, float],
     generator: torch.Generator,
 ) -> tuple[Tensor, Tensor]:
-    """Spectacles drawn over an image, and which landmarks dark lenses hide.
-
-    Args:
-        image: colours with a fourth channel that is 1 on the person, (H,W,4).
-        marks: iBUG's 68 on the head, (68,3) millimetres.
-        form: see ``Looks.glasses``.
-        generator: of the frame's roundness and what the lenses mirror.
-
-    Returns:
-        The image (H,W,4), and of each landmark whether it is hidden, (68,) bool.
-    """
+    """Spectacles of a form (``Looks.glasses``) drawn over an image (H,W,4), and which landmarks (68,3) dark lenses
+    hide, (68,) bool."""
     half_width, half_height, grey, thickness, lens = form
     turn = torch.linspace(0, 2 * math.pi, 41).double()[:-1]
     square = uniform(0.35, 1.0, generator)  # the exponent of a superellipse: 1 is round

@@ -23,11 +23,8 @@ _MIRROR = torch.tensor([-1.0, 1.0, 1.0])
 
 
 def gaze_weights(gaze: Tensor) -> Tensor:
-    """ARKit's weights (52,) of lids that follow a gaze.
-
-    Args:
-        gaze: of the right and the left eye, (2,2) radians: to the person's left, up.
-    """
+    """ARKit's weights (52,) of lids that follow the gaze of the right and the left eye, (2,2), to the person's left
+    and up."""
     weights = torch.zeros(len(ARKIT))
     for row, (side, aside) in enumerate((("Right", "In"), ("Left", "Out"))):
         across, up = (float(angle) / math.radians(full) for angle, full in zip(gaze[row], FULL_GAZE, strict=True))
@@ -41,13 +38,6 @@ def with_turned_eyes(kind: HeadKind, rest: Tensor, posed: Tensor, gaze: Tensor) 
     """A posed head whose eyeballs are those at rest, turned about their middles, with lids that lie on them.
 
     Weights move lids along straight lines, which half-way cut through the eyeballs: they are put back on them.
-
-    Args:
-        rest, posed: the head, (V,3) millimetres.
-        gaze: see :func:`gaze_weights`.
-
-    Returns:
-        (V,3).
     """
     turned = posed.clone()
     for row, eye in enumerate(_eyes(id(kind), kind)):

@@ -97,11 +97,7 @@ class FilmSources:
 
 
 def webcam_film(scene: Scene, sources: FilmSources, kept: Path, progress: Progress | None = None) -> Film:
-    """Renders a scene, or reads what was rendered before.
-
-    Args:
-        progress: called with each step and how far it is.
-    """
+    """Renders a scene, or reads what was rendered before."""
     generator = torch.Generator().manual_seed(scene.seed)
     kind = performer_kind() if scene.people == "performer" or sources.ict is None else _people(sources.ict)
     head, looks = kind.draw(generator), draw_looks(generator)

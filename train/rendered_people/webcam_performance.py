@@ -68,9 +68,6 @@ def sitting(
     """Someone whose head turns and sways slowly about the neck while the face goes through a take.
 
     Args:
-        weights: of ARKit's shapes, (T,52).
-        fps: frames a second.
-        settings: where and how they sit.
         away: second at which they begin to turn away; they look back after that.
         hand: second at which a hand begins to rise to the mouth.
 
@@ -103,13 +100,8 @@ def sitting(
 
 
 def with_speech(weights: Tensor, fps: float, generator: torch.Generator, start: float, end: float) -> Tensor:
-    """Weights (T,52) with a mouth that talks between two seconds, and meanwhile smiles once and opens wide once.
-
-    Args:
-        weights: of a take whose mouth rests.
-        fps: frames a second.
-        start, end: seconds.
-    """
+    """Weights (T,52) of a resting mouth that talks between two seconds, and meanwhile smiles once and opens wide
+    once."""
     mouth = torch.tensor([name.startswith(_MOUTH) for name in ARKIT])
     made = perform(len(weights), generator, fps).weights
     assert made is not None

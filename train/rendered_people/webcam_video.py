@@ -83,12 +83,7 @@ def webcam_frames(
     settings: WebcamSettings = WebcamSettings(),
     progress: Progress | None = None,
 ) -> Iterator[WebcamFrame]:
-    """Renders frame by frame; lights, background, hair and hand stay what they are.
-
-    Args:
-        seed: of the lights, the background and the noise.
-        progress: called with each step and how far it is.
-    """
+    """Renders frame by frame; lights, background, hair and hand stay what they are."""
     progress = progress or silent
     room = clutter(settings.height, settings.width, np.random.default_rng((seed, 0)))
     noise = np.random.default_rng((seed, 1))
