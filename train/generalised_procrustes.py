@@ -28,13 +28,12 @@ class Procrustes:
 def generalised_procrustes(
     shapes: Samples,
     scale: bool = False,
-    weights: Tensor | None = None,
     initial_mean: Tensor | None = None,
     progress: Progress | None = None,
 ) -> Procrustes:
     r"""The rigid motions that lay shapes on their common mean.
 
-    .. math:: \min_{R_m, t_m, \bar x} \sum_m \sum_v w_v \lVert s_m R_m x_{mv} + t_m - \bar x_v \rVert^2
+    .. math:: \min_{R_m, t_m, \bar x} \sum_m \sum_v \lVert s_m R_m x_{mv} + t_m - \bar x_v \rVert^2
 
     Alternately shapes are aligned to the mean and the mean computed anew, until it moves by under a micrometre. With
     scales, the mean keeps the shapes' mean size, or all would shrink to nothing.
@@ -49,9 +48,8 @@ def generalised_procrustes(
     count, vertices, channels = shapes.shape
     if channels != 3 or count < 1:
         raise ShapeError(f"shapes: found {tuple(shapes.shape)}, expected (M,V,3)")
-    for name, tensor, expected in (("initial_mean", initial_mean, (vertices, 3)), ("weights", weights, (vertices,))):
-        if tensor is not None and tensor.shape != expected:
-            raise ShapeError(f"{name}: found {tuple(tensor.shape)}, expected {expected}")
+    if initial_mean is not None and initial_mean.shape != (vertices, 3):
+        raise ShapeError(f"initial_mean: found {tuple(initial_mean.shape)}, expected ({vertices}, 3)")
     parts = list(blocks(shapes))
     mean = shapes.read(0, 1)[0].double() if initial_mean is None else initial_mean.double()
     size = 0.0
@@ -63,16 +61,15 @@ def generalised_procrustes(
             if not bool(torch.isfinite(read).all()):
                 bad = int((~torch.isfinite(read)).flatten(1).any(1).nonzero()[0, 0]) + begin
                 raise ValueRangeError(f"shapes: number {bad} holds NaN or infinity; expected none")
-            target, weight = mean.expand_as(read), None if weights is None else weights.expand(read.shape[:2])
-            poses.append(similarity_transform(read, target, weight, scale))
+            poses.append(similarity_transform(read, mean.expand_as(read), scale=scale))
             total += poses[-1].apply(read).sum(0)
-            sizes += float(_size(read, weights).sum())
+            sizes += float(_size(read).sum())
         found = total / count
         if scale:
             size = size or sizes / count
-            found = found * (size / float(_size(found[None], weights)))
+            found = found * (size / float(_size(found[None])))
         # What the mean as a whole has drifted by is taken back: the frame is the initial mean's.
-        found = similarity_transform(found[None], mean[None], _one(weights), scale=False).apply(found)[0]
+        found = similarity_transform(found[None], mean[None], scale=False).apply(found)[0]
         moved, mean, iterations = float((found - mean).norm(dim=1).mean()), found, iterations + 1
         progress("aligning the shapes", iterations)
     pose = Similarity(*(torch.cat(t) for t in zip(*((p.scale, p.rotation, p.translation) for p in poses), strict=True)))
@@ -84,13 +81,6 @@ def aligned(shapes: Samples, found: Procrustes) -> MovedSamples:
     return MovedSamples(shapes, found.poses)
 
 
-def _one(weights: Tensor | None) -> Tensor | None:
-    return None if weights is None else weights[None]
-
-
-def _size(shapes: Tensor, weights: Tensor | None) -> Tensor:
+def _size(shapes: Tensor) -> Tensor:
     """Root mean square distance from the centre, (M,)."""
-    weight = torch.ones(shapes.shape[1]) if weights is None else weights
-    weight = (weight / weight.sum()).to(shapes)[None, :, None]
-    centre = (weight * shapes).sum(1, keepdim=True)
-    return (weight * (shapes - centre).square()).sum((1, 2)).sqrt()
+    return (shapes - shapes.mean(1, keepdim=True)).square().sum(2).mean(1).sqrt()

@@ -64,9 +64,8 @@ def test_terms_add_and_scale() -> None:
     basis, rest, targets, weights = layout()
     targets[0, 0] = torch.nan
     markers = marker_term(basis, rest, targets)
-    center = torch.full_like(weights, 0.3)
-    total = markers + sparsity_term(5, 0.7, weights) + 2.0 * ridge_term(5, 0.2, weights, center)
-    wanted = markers.value(weights) + 0.7 * weights.sum(-1) + 0.4 * (weights - 0.3).square().sum(-1)
+    total = markers + sparsity_term(5, 0.7, weights) + 2.0 * ridge_term(5, 0.2, weights)
+    wanted = markers.value(weights) + 0.7 * weights.sum(-1) + 0.4 * weights.square().sum(-1)
     torch.testing.assert_close(total.value(weights), wanted)
 
 

@@ -76,16 +76,6 @@ def test_blocks_change_nothing(shapes: torch.Tensor, monkeypatch: pytest.MonkeyP
     assert torch.equal(part.read(1, 3), aligned(apart, whole).read(4, 6))
 
 
-def test_weights_say_what_is_held_still(shapes: torch.Tensor) -> None:
-    weights = torch.zeros(50, dtype=torch.float64)
-    weights[:10] = 1
-    still = shapes.clone()
-    still[:, :10] = shapes[:1, :10]
-    apart = SamplesInMemory(moved(still))
-    laid = aligned(apart, generalised_procrustes(apart, weights=weights)).read(0, 11)
-    assert spread(laid[:, :10]) < 1e-6
-
-
 def test_what_cannot_be_laid_is_refused(shapes: torch.Tensor) -> None:
     with pytest.raises(ShapeError, match=r"expected \(M,V,3\)"):
         generalised_procrustes(SamplesInMemory(shapes[..., :2]))

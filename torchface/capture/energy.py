@@ -108,14 +108,12 @@ def sparsity_term(shapes: int, weight: float | Tensor, like: Tensor) -> Quadrati
     return Quadratic(like.new_zeros(shapes, shapes), weight * like.new_ones(1, shapes))
 
 
-def ridge_term(shapes: int, weight: float | Tensor, like: Tensor, center: Tensor | None = None) -> Quadratic:
-    r"""Tikhonov's term, :math:`E(w) = \varepsilon \lVert w - \bar w \rVert^2`, about 0 or (B,N): one minimum,
-    whatever the markers see; :math:`\varepsilon` is mm² a marker. Source: thesis 4.1.4, equation 33."""
+def ridge_term(shapes: int, weight: float | Tensor, like: Tensor) -> Quadratic:
+    r"""Tikhonov's term, :math:`E(w) = \varepsilon \lVert w \rVert^2`: one minimum, whatever the markers see;
+    :math:`\varepsilon` is mm² a marker. Source: thesis 4.1.4, equation 33."""
     check_weight("ridge", weight)
     H = 2 * weight * torch.eye(shapes, dtype=like.dtype, device=like.device)
-    if center is None:
-        return Quadratic(H, like.new_zeros(1, shapes))
-    return Quadratic(H, -2 * weight * center.to(like), weight * center.to(like).square().sum(-1))
+    return Quadratic(H, like.new_zeros(1, shapes))
 
 
 def pull_term(targets: Tensor, strength: Tensor) -> Quadratic:

@@ -29,8 +29,9 @@ def line_pieces(
         start = cut
 
 
-def word_pieces(path: Path, data: bytes, start: int = 0) -> Iterator[list[bytes]]:
-    """The words behind a place, as many at a time as stand in a piece; lines do not matter."""
+def word_pieces(path: Path, data: bytes) -> Iterator[list[bytes]]:
+    """The words, as many at a time as stand in a piece; lines do not matter."""
+    start = 0
     while start < len(data):
         words = data[start : start + _PIECE].split()
         if start + _PIECE < len(data) and not data[start + _PIECE - 1 : start + _PIECE].isspace():

@@ -21,16 +21,15 @@ from torchface.number_checks import checked_count, checked_number
 from torchface.optim.box_problem import BoxProblem
 from torchface.optim.free_variables import solve_free
 
-_STEP_LENGTHS, _BLOCKED_TRIES = 10, 8
+_SETS, _STEP_LENGTHS, _BLOCKED_TRIES = 10, 10, 8
 # Added to the scaled diagonal (all ones), times the residual: where H is singular the step stays short in directions
 # that only rounding fills, and the term fades as fast as the solution comes near.
 _DAMPING = 1e-5
 
 
-def primal_dual_active_set(problem: BoxProblem, start: Tensor, iterations: int = 10) -> tuple[Tensor, Tensor]:
+def primal_dual_active_set(problem: BoxProblem, start: Tensor) -> tuple[Tensor, Tensor]:
     """The minimisers (B,N) of the problems whose active set, first that of ``start``, settles, else ``start``; and
     the gradient there."""
-    checked_count("primal_dual_active_set: iterations", iterations)
     found, slope = start.clone(), problem.gradient(start)
     gradient = slope.clone()
     rows = torch.arange(len(start), device=start.device)
@@ -38,7 +37,7 @@ def primal_dual_active_set(problem: BoxProblem, start: Tensor, iterations: int =
     at_lower = x <= problem.lower
     at_upper = (x >= problem.upper) & ~at_lower
     before = torch.full_like(rows, start.shape[1] + 1)
-    for _ in range(iterations):
+    for _ in range(_SETS):
         free = ~(at_lower | at_upper)
         x = x + solve_free(part.H, part.diagonal, free, -slope)
         slope = part.gradient(x)

@@ -4,10 +4,9 @@ import torch
 from torch import Tensor
 
 from torchface.enhancement.matching.region_projection import Matched, RegionProjection
-from torchface.number_checks import checked_count, checked_number
 
-COMPONENTS = 60
-RIDGE = 1e-4  # of the mean variance of a component
+_COMPONENTS = 60
+_RIDGE = 1e-4  # of the mean variance of a component
 _TURNS, _TRIED = 4, 400  # parts of the sequences; frames at most
 
 
@@ -21,19 +20,12 @@ class LearnedMap:
     on principal components. In the database's convex hull nothing is added. From a distance :math:`\delta` on it is
     multiplied by :math:`(\delta / d)^2` of the frame's distance d, and so fades: far away the nearest detail alone is
     left. How much of it counts, :math:`\beta`, see :func:`map_shares`.
-
-    Args:
-        ridge: as a share of their mean variance.
     """
 
-    def __init__(
-        self, projection: RegionProjection, coefficients: Tensor, components: int = COMPONENTS, ridge: float = RIDGE
-    ) -> None:
-        checked_count("components", components, 1)
-        checked_number("ridge", ridge, above=True)
+    def __init__(self, projection: RegionProjection, coefficients: Tensor) -> None:
         self._projection = projection
         # The projection's coordinates are principal components about the mean, the largest first.
-        self._maps = [_ridge_regression(known[:, :components], coefficients, ridge) for known in projection.known]
+        self._maps = [_ridge_regression(known[:, :_COMPONENTS], coefficients) for known in projection.known]
 
     def corrections(self, features: Tensor, matched: Matched, reach: Tensor, shares: Tensor) -> Tensor:
         r"""What to add to the blend's coefficients, (T,R,r), by each region's :math:`\delta` (R,) and :math:`\beta`
@@ -72,10 +64,10 @@ def map_shares(
     added = torch.zeros_like(lacks)
     faded = _faded(reach.double(), matched.distances)
     for region, known in enumerate(projection.known):
-        beyond = (known[chosen] - matched.weights[:, region] @ known)[:, :COMPONENTS]
+        beyond = (known[chosen] - matched.weights[:, region] @ known)[:, :_COMPONENTS]
         for left_out in range(turns):
             others, own = turn != left_out, turn[chosen] == left_out
-            learned = _ridge_regression(known[others, :COMPONENTS], coefficients[others], RIDGE)
+            learned = _ridge_regression(known[others, :_COMPONENTS], coefficients[others])
             added[own, region] = (beyond[own] @ learned) * faded[own, region, None]
     helps = torch.einsum("tri,rij,trj->r", added, products, lacks)
     whole = torch.einsum("tri,rij,trj->r", added, products, added)
@@ -87,9 +79,9 @@ def _faded(reach: Tensor, distances: Tensor) -> Tensor:
     return (reach / distances).clamp(max=1).square()
 
 
-def _ridge_regression(scores: Tensor, target: Tensor, ridge: float) -> Tensor:
+def _ridge_regression(scores: Tensor, target: Tensor) -> Tensor:
     """The map (q,r) from scores (K,q) to targets (K,r), both less their means."""
     scores, target = scores - scores.mean(0), target.double() - target.double().mean(0)
     gram = scores.T @ scores
-    weight = max(ridge * float(gram.diagonal().mean()), 1e-30)
+    weight = max(_RIDGE * float(gram.diagonal().mean()), 1e-30)
     return torch.linalg.solve(gram + weight * torch.eye(len(gram)).to(gram), scores.T @ target)

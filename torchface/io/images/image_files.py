@@ -74,11 +74,11 @@ def encode_png(image: Tensor) -> bytes:
     return buffer.getvalue()
 
 
-def encode_jpeg(image: Tensor, quality: int = 90) -> bytes:
+def encode_jpeg(image: Tensor) -> bytes:
     """(3,H,W) in [0,1] as the bytes of a JPEG with colours as fine as the light."""
     array = image.detach().clamp(0, 1).mul(255).round().to(torch.uint8).permute(1, 2, 0).cpu().numpy()
     buffer = io.BytesIO()
-    Image.fromarray(np.ascontiguousarray(array)).save(buffer, "JPEG", quality=quality, subsampling=0)
+    Image.fromarray(np.ascontiguousarray(array)).save(buffer, "JPEG", quality=90, subsampling=0)
     return buffer.getvalue()
 
 

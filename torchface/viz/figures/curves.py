@@ -143,10 +143,8 @@ def named_bars(values: Tensor, names: Sequence[str], label: str) -> Tensor:
     return from_figure(figure)
 
 
-def motion_curves(
-    translation: Tensor, degrees: Tensor, fps: float, true: tuple[Tensor, Tensor] | None = None
-) -> Tensor:
-    """Translations (T,3), millimetres, and rotations (T,3), degrees, over time, with the true ones if any; (3,H,W)."""
+def motion_curves(translation: Tensor, degrees: Tensor, fps: float) -> Tensor:
+    """Translations (T,3), millimetres, and rotations (T,3), degrees, over time; (3,H,W)."""
     figure = new_figure(10, 6, layout="constrained")
     grid, seconds = figure.subplots(3, 2, sharex=True), torch.arange(len(translation)) / fps
     for column, (values, unit) in enumerate(((translation, "mm along"), (degrees, "° about"))):
@@ -154,11 +152,7 @@ def motion_curves(
         for axis, name in enumerate("xyz"):
             axes = grid[axis, column]
             axes.axhline(0.0, color="grey", linewidth=0.8)
-            if true is not None:
-                axes.plot(seconds, true[column][:, axis], color=TRUE, linewidth=2, label="true")
-            axes.plot(seconds, values[:, axis], color=SOLVED, linewidth=0.9, label="solved")
+            axes.plot(seconds, values[:, axis], color=SOLVED, linewidth=0.9)
             axes.set(ylabel=f"{unit} {name}", xlim=(0.0, float(seconds[-1]) or 1.0), ylim=(-reach, reach))
         grid[2, column].set_xlabel("seconds")
-    if true is not None:
-        _legend_above(figure, grid[0, 0])
     return from_figure(figure)

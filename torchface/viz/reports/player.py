@@ -76,9 +76,8 @@ class Player:
     start: int = 0
 
 
-def write_player(player: Player, folder: Path, name: str = "performance") -> str:
-    """Writes ``player.js`` and the data as ``NAME.js`` into a folder; gives the HTML that plays it, for
-    ``Section.markup``.
+def write_player(player: Player, folder: Path) -> str:
+    """Writes ``player.js`` and the data into a folder; gives the HTML that plays it, for ``Section.markup``.
 
     Long takes and high frame rates are thinned to 60 frames a second and 6,000 frames.
     """
@@ -121,8 +120,9 @@ def write_player(player: Player, folder: Path, name: str = "performance") -> str
     script = files("torchface.viz.reports").joinpath("player.js").read_bytes()
     with all_or_none():
         write_file(folder / "player.js", script)
-        write_file(folder / f"{name}.js", f'torchfacePlayer("{name}",{json.dumps(data, allow_nan=False)});\n'.encode())
-    return f'<div id="{name}"></div>\n<script src="player.js"></script>\n<script src="{name}.js"></script>\n'
+        content = f'torchfacePlayer("performance",{json.dumps(data, allow_nan=False)});\n'
+        write_file(folder / "performance.js", content.encode())
+    return '<div id="performance"></div>\n<script src="player.js"></script>\n<script src="performance.js"></script>\n'
 
 
 def _rig(rig: BlendshapeRig) -> dict[str, Any]:
