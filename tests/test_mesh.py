@@ -42,9 +42,7 @@ def test_part_keeps_positions_seams_and_masks() -> None:
     assert torch.equal(ids[part.polygons.clamp(min=0)].sort(1).values[:, -1] % 4 < 3, torch.ones(4, dtype=torch.bool))
     kept = (mesh.vertices[mesh.faces][..., 0] < 3).all(-1)
     assert torch.equal(ids[part.faces], mesh.faces[kept])
-    assert part.uv_faces is not None
     assert torch.equal(part.uvs[part.uv_faces], mesh.uvs[mesh.uv_faces[kept]])
-    assert part.annotations.landmarks is not None
     assert torch.equal(ids[part.annotations.landmarks], torch.tensor([1, 2]))
     assert part.annotations.mirror is None  # its other half is gone
     assert part.annotations.contacts.tolist() == [[1, 2]]

@@ -50,7 +50,6 @@ def film_scene(frames: int) -> Scene:
 def _film_rig(generator: torch.Generator) -> BlendshapeRig:
     coarse = performer(texture=False)
     mesh = coarse.neutral
-    assert mesh.polygons is not None
     operator, quads = subdivision_operator(mesh.polygons, len(mesh.vertices))
     stacked = torch.cat([coarse.vertices[None], coarse.deltas]).permute(1, 0, 2).flatten(1).double()
     fine = torch.from_numpy(operator @ stacked.numpy()).unflatten(1, (-1, 3)).permute(1, 0, 2).float()

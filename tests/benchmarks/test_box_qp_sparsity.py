@@ -93,6 +93,4 @@ def test_sparsity_on_real_takes(real_capture: tuple[BlendshapeRig, Attachment, l
 
     chosen = trials[sparsities.index(SPARSITY)]
     assert chosen.active < trials[0].active
-    assert chosen.weight_error is not None
-    assert trials[0].weight_error is not None
     assert chosen.weight_error < trials[0].weight_error

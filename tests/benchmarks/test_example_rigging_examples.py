@@ -103,7 +103,6 @@ def with_correctives(rig: BlendshapeRig, head: Mesh, seed: int) -> BlendshapeRig
 def performer_cases() -> list[Case]:
     template = performer(texture=False)
     take = perform(2400, torch.Generator().manual_seed(5)).weights
-    assert take is not None
     frames = template.weights_from(take).clamp(0, 1)
     unseen = frames[torch.linspace(60, len(frames) - 1, 20).long()]
     people = draw_identities(3, torch.Generator().manual_seed(0))
@@ -119,7 +118,6 @@ def ict_cases(folder: Path, performances: list[Path]) -> list[Case]:
     frames = []
     for path in performances:
         track = load_take(path).weights
-        assert track is not None
         frames.append(template.weights_from(track).clamp(0, 1))
     takes = torch.cat(frames)
     unseen = takes[torch.linspace(100, len(takes) - 100, 20).long()]

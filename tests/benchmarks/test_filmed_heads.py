@@ -38,7 +38,6 @@ def test_heads_of_films(data: Path) -> None:
     rows = []
     for name, film in films.items():
         inputs = load_inputs(film.path, None, TrackSettings())
-        assert inputs.heads is not None
         with TemporaryDirectory() as folder:
             reading, _ = read_frames(inputs, TrackState(Path(folder), inputs.reading_key), silent)
         marks = smoothed_landmarks(inputs, reading, None)

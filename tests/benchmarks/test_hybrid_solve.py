@@ -139,7 +139,6 @@ def solved(classifier: ActionUnitClassifier, one: Film, units: tuple[str, ...] |
     alignment = align_take(one.rig, one.attachment, one.take, 0)
     sites = rest_residual(one.rig, one.attachment, one.take, alignment)
     solver = MarkerSolver(one.rig, sites, alignment)
-    assert one.take.markers is not None
     markers = solver.arrange(one.take.markers)
     table = load_shape_table("arkit")
     curves = action_unit_curves(

@@ -62,7 +62,6 @@ class Lid:
     """One eye's two lid contours, separated by what the blink moves down."""
 
     def __init__(self, rig: BlendshapeRig, hole: Tensor, blink: int) -> None:
-        assert rig.neutral.polygons is not None
         ring = rings(rig.neutral, hole, 2)[2]
         self.blink = blink
         falls = rig.deltas[blink, ring, 1] < -1

@@ -59,7 +59,6 @@ def test_solve_writes_the_weights_that_the_solver_finds(shoot: Path, dome_rig: B
     out = shoot / "new folder" / "weights.csv"
     run("solve", shoot / "rig.glb", shoot / "take.c3d", "--attachment", shoot / "attachment.json", "--out", out)
     written = load_take(out).weights
-    assert written is not None
     found = dome_rig.weights_from(written).float()
     torch.testing.assert_close(found, torch.load(shoot / "true.pt", weights_only=True), atol=0.06, rtol=0)
     solver, take = MarkerSolver(load_rig(shoot / "rig.glb"), place_markers(dome_rig, 30)), load_take(shoot / "take.c3d")
@@ -68,7 +67,6 @@ def test_solve_writes_the_weights_that_the_solver_finds(shoot: Path, dome_rig: B
     common = ("--attachment", shoot / "attachment.json", "--out", out, "--quiet")
     run("solve", shoot / "rig.glb", shoot / "take.c3d", *common, "--frame-by-frame")
     written, single = load_take(out).weights, solver.solve_take(take).weights
-    assert written is not None
     frames = dome_rig.weights_from(written).float()
     torch.testing.assert_close(frames, single.values[..., 0].float(), atol=1e-5, rtol=0)
     assert weight_jitter(found) < weight_jitter(frames)
@@ -85,7 +83,6 @@ def test_solve_with_a_neutral_frame_undoes_the_space_of_the_take(shoot: Path, do
     common = ("--attachment", shoot / "attachment.json", "--out", out, "--quiet")
     run("solve", shoot / "rig.glb", shoot / "moved.c3d", *common, "--neutral-frame", "0", "--scale", "free")
     written = load_take(out).weights
-    assert written is not None
     true = torch.load(shoot / "true.pt", weights_only=True)
     torch.testing.assert_close(dome_rig.weights_from(written).float(), true, atol=0.08, rtol=0)
 
@@ -283,7 +280,6 @@ def test_solve_cleans_a_slipping_take_and_reports_it(
     assert "M004 ↔ M021" in html
     assert {path.name for path in page.glob("*.png")} >= {"error.png", "helmet.png", "weights1.png"}
     written = load_take(out).weights
-    assert written is not None
     assert float((dome_rig.weights_from(written).float() - weights).abs().mean()) < 0.05
 
 
@@ -296,7 +292,6 @@ def test_solve_aligns_a_take_without_a_neutral_frame(shoot: Path, dome_rig: Blen
     common = ("--attachment", shoot / "attachment.json", "--out", out, "--quiet")
     run("solve", shoot / "rig.glb", shoot / "moved.c3d", *common, "--align", "--keep-rest")
     written = load_take(out).weights
-    assert written is not None
     true = torch.load(shoot / "true.pt", weights_only=True)
     assert float((dome_rig.weights_from(written).float() - true).abs().mean()) < 0.05
 

@@ -112,7 +112,6 @@ class MayaScene:
             return
         base, low, high = span[1], int(span[2]), int(span[3] or span[2])
         assert span[3] is None or high > low
-        assert count is not None
         assert high < count
         node.values.setdefault(base, [])
         node.values.setdefault(f"{base}#", ["0"])

@@ -50,8 +50,6 @@ def plain(color: tuple[float, float, float], alpha: Tensor) -> Tensor:
 
 def over_vertices(mesh: Mesh, values: Tensor, size: int = 512) -> Tensor:
     """Values (V,) of vertices as a map (size,size) in texture coordinates."""
-    assert mesh.uvs is not None
-    assert mesh.uv_faces is not None
     texels = rasterise_uvs(mesh.uvs, mesh.uv_faces, size, size)
     page = torch.zeros(size * size, dtype=torch.float64)
     page[texels.texels] = texels.interpolate(values[:, None].double(), mesh.faces)[:, 0]

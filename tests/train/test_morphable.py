@@ -46,7 +46,6 @@ def folder(heads: list[Mesh], tmp_path_factory: pytest.TempPathFactory) -> Path:
     for number, mesh in enumerate(heads):
         vertices = mesh.vertices @ turns[number].T + 80 * torch.randn(3, generator=generator)
         light = torch.exp(0.15 * torch.randn(3, generator=generator))
-        assert mesh.colors is not None
         colors = to_srgb(to_linear(mesh.colors) * light).clamp(0, 1)
         save_mesh(replace(mesh, vertices=vertices, colors=colors), path / f"scan_{number}.glb")
     return path

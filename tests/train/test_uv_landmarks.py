@@ -114,7 +114,6 @@ def test_registration_is_given_landmarks(trained: tuple[Trained, Path], folder: 
     rotation = inverse.rotation @ own.rotation
     translation = inverse.apply(own.translation[:, None])[:, 0]
     found = finder(template, scan, Similarity(inverse.scale * own.scale, rotation, translation))
-    assert found is not None
     vertices, points = found
     assert vertices.dtype == torch.int64
     assert len(vertices) == len(points) > 60

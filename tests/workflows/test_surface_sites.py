@@ -16,7 +16,6 @@ def renumbered(scale: float) -> BlendshapeRig:
     place = order.argsort()
     mesh = rig.neutral
     notes = mesh.annotations
-    assert notes.landmarks is not None
     moved = type(mesh)(
         scale * sculpted_vertices().float()[order], place[mesh.faces], annotations=type(notes)(place[notes.landmarks])
     )

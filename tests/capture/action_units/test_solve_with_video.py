@@ -30,7 +30,6 @@ def test_the_video_leads_what_markers_hardly_see(
     ):
         main([*words, *more, "--out", str(tmp_path / f"{name}.csv"), "--quiet"])
         solved = load_take(tmp_path / f"{name}.csv").weights
-        assert solved is not None
         errors.append((session.rig.weights_from(solved) - session.performance.weights).abs().mean(0))
     told = capsys.readouterr().err
     assert "video: predicts" in told

@@ -188,9 +188,7 @@ def test_a_real_take_on_a_real_rig_with_correctives(ict_folder: Path, performanc
     deltas = torch.stack([0.5 * both * torch.tensor([0.6, 0.0, 0.8]), 0.3 * blink.roll(1, 1)])
     rig = BlendshapeRig(rig.neutral, rig.deltas, rig.names, Correctives(deltas, definitions))
     take = load_take(performances[0]).weights
-    assert take is not None
     weights = rig.weights_from(take)
-    assert rig.activation is not None
     on = rig.activation(weights) * deltas.norm(dim=-1).amax(1)
     weights = weights[on.sum(1).argsort(descending=True)[:10]]
     moved = (rig.deltas.norm(dim=-1).amax(0) > 1).nonzero()[:, 0]

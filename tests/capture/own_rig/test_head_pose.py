@@ -145,7 +145,6 @@ def test_expression_hardly_moves_the_stable_landmarks(
     moves = []
     for rig in rigs:
         annotations = rig.neutral.annotations
-        assert annotations.landmarks is not None
         weights = torch.cat([(t.values[..., 0] @ mapping(t.names, rig.names).T).clamp(0, 1) for t in tracks if t])
         away = torch.einsum("tn,nlc->tlc", weights, rig.deltas[:, annotations.landmarks])
         moves.append(away.square().sum(-1).mean(0).sqrt())
@@ -177,7 +176,6 @@ def test_expression_hardly_turns_the_head(
 def test_as_openface_on_a_real_face(ict_folder: Path, data: Path) -> None:
     rig = load_rig(ict_folder, part="face")
     annotations = rig.neutral.annotations
-    assert annotations.landmarks is not None
     points = rig.neutral.vertices[annotations.landmarks]
     take = load_take(data / "landmarks" / "openface_100_frames.csv")
     columns = take.extras["columns"]

@@ -151,7 +151,6 @@ def test_a_laugh_of_most_of_the_take_is_no_offset(neutral: int | None) -> None:
     landmarks = seen(person(5), weights, 0.5 * planted_offsets())
     solver = solver_of(person())
     offsets = estimate_offsets(solver, landmarks, identity_modes=modes(), neutral=neutral)
-    assert offsets is not None
     found = solver.shifted(offsets)(landmarks[::4]).weights
     for names in (SMILE, ("jawOpen",)):
         rows = [person().names.index(name) for name in names]
@@ -178,7 +177,6 @@ def test_crying_is_crying_on_another_head() -> None:
     landmarks = seen(person(3), weights, 0.5 * planted_offsets())
     solver = solver_of(person())
     offsets = estimate_offsets(solver, landmarks)
-    assert offsets is not None
     found = solver.shifted(offsets)(landmarks).weights[FRAMES + 3 :].mean(0)
 
     def mean(name: str) -> float:
@@ -249,7 +247,6 @@ def test_what_was_read_of_an_expression_that_never_ends_is_no_offset() -> None:
     found = {way: estimate_offsets(solver, landmarks, read=given) for way, given in (("read", read), ("guessed", None))}
     off = {}
     for way, offsets in found.items():
-        assert offsets is not None
         solved = solver.shifted(offsets)(landmarks, measured=FaceMeasurements(weights=read)).weights
         rows = [person().names.index(name) for name in constant]
         off[way] = float((solved - weights)[:, rows].mean(0).abs().mean())
@@ -263,7 +260,6 @@ def test_offsets_do_not_move_the_head(seed: int) -> None:
     weights, at = talking({}), torch.linspace(0, 1, FRAMES)
     landmarks, solver = seen(person(seed), weights), solver_of(person())
     offsets = estimate_offsets(solver, landmarks, identity_modes=modes())
-    assert offsets is not None
     depth = solver.shifted(offsets)(landmarks).translation[:, 2]
     mine, rig = (head.vertices[head.neutral.landmarks].double() for head in (person(seed), person()))
     size = float(similarity_transform(rig[None], mine[None]).scale)

@@ -313,7 +313,6 @@ def test_performed_weights_come_back_through_a_prior_that_knows_them() -> None:
     rig = whole_rig()
     generator = torch.Generator().manual_seed(0)
     track = perform(400, generator).weights
-    assert track is not None
     take = rig.weights_from(track)
     prior = ShapePrior.fit([take], rig.names)
     weights = take[40::60].double()

@@ -17,7 +17,6 @@ from torchface.synthetic import performer
 def head() -> Mesh:
     """The embedded performer, whose texture coordinates have seams."""
     mesh = performer().neutral
-    assert mesh.uvs is not None
     return replace(mesh, colors=torch.rand(mesh.vertices.shape, generator=torch.Generator().manual_seed(0)))
 
 

@@ -148,7 +148,6 @@ def test_wrinkle_maps_are_valid_and_three_shows_the_neutrals(node: str, tmp_path
 
 
 def assert_tangents_are_mikktspaces(node: str, folder: Path, mesh: Mesh) -> None:
-    assert mesh.uv_faces is not None
     points, uvs = mesh.vertices.double(), mesh.uvs.double()
     normals = vertex_normals(points, mesh.faces)
     space = tangent_space(points, mesh.faces, uvs, mesh.uv_faces, normals)

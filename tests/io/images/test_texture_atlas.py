@@ -20,7 +20,6 @@ def picture(seed: int, height: int, width: int) -> torch.Tensor:
 
 
 def shown(mesh: Mesh, triangle: int, at: torch.Tensor) -> torch.Tensor:
-    assert mesh.texture is not None
     return sample_texture(mesh.texture, at @ mesh.uvs[mesh.uv_faces[triangle]])
 
 

@@ -71,7 +71,6 @@ def patch(azimuth: tuple[float, float], latitude: tuple[float, float], columns: 
 def head(columns: int = 60, rows: int = 48) -> Mesh:
     """The whole head, smooth and coarse, closed round the back by a seam of the texture."""
     open_head = patch((-180, 180), (-80, 80), columns, rows, 0.0)
-    assert open_head.polygons is not None
     column = torch.arange(len(open_head.vertices)) % (columns + 1)
     joined = torch.arange(len(open_head.vertices)) - torch.where(column == columns, columns, 0)
     used, compact = joined[open_head.polygons].unique(return_inverse=True)
@@ -102,8 +101,6 @@ def moved(mesh: Mesh, degrees: float, shift: tuple[float, float, float]) -> Mesh
 def error_degrees(mesh: Mesh, baked: NormalMap) -> tuple[Tensor, Tensor]:
     """At 20,000 texels: the angle between the normals that a renderer gets and the true ones, and between those and a
     head's without wrinkles; where wrinkles turn the normal by more than 8 degrees."""
-    assert mesh.uvs is not None
-    assert mesh.uv_faces is not None
     texels = rasterise_uvs(mesh.uvs, mesh.uv_faces, *baked.hit.shape)
     hit = baked.hit.flatten()[texels.texels].nonzero()[:, 0]
     some = hit[torch.randperm(len(hit), generator=torch.Generator().manual_seed(0))[:20000]]
@@ -202,7 +199,6 @@ def test_a_turned_texture_turns_the_map_but_not_the_normals_it_stands_for(forehe
 def test_wrinkles_planted_on_a_real_head_come_back_across_its_texture(ict_folder: Path) -> None:
     neutral = load_rig(ict_folder, part="face").neutral
     mesh = neutral.with_vertices(neutral.vertices.double())
-    assert mesh.uv_faces is not None
     smooth = vertex_normals(mesh.vertices, mesh.faces)
     brow = mesh.vertices[mesh.landmarks[17:27]].mean(0)
 

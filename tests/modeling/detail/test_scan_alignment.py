@@ -42,7 +42,6 @@ class Planted:
         """Where wrinkles turn the skin by more than 8 degrees: how far the map's normals are from the true ones, and
         how far the smooth skin's are, degrees."""
         mesh = self.raised
-        assert mesh.uv_faces is not None
         texels = rasterise_uvs(mesh.uvs, mesh.uv_faces, *baked.hit.shape)
         hit = baked.hit.flatten()[texels.texels].nonzero()[::3, 0]
         triangles, barycentric = texels.triangles[hit], texels.barycentric[hit]
@@ -78,7 +77,6 @@ def smooth_skin(mesh: Mesh, brow: Tensor) -> tuple[Tensor, Tensor]:
     seen = (y > -55) & (y < 55) & (z > -45)
     wrinkled = (x.abs() < 44) & (y > 8) & (y < 40) & (z > -45)
     forehead = submesh(fine, wrinkled).mesh
-    assert forehead.polygons is not None
     skin, quads = forehead.vertices.double(), forehead.polygons
     for _ in range(3):
         skin, quads, _ = catmull_clark(skin, quads)

@@ -225,7 +225,6 @@ def test_a_difference_that_the_model_does_not_know_is_found(rig: BlendshapeRig, 
 def test_landmarks_as_annotators_put_them_are_no_other_face(rig: BlendshapeRig, model: HeadModel) -> None:
     """Of a picture in which eyes end before their corners, and brows lie lower, neither does in the head."""
     notes, at = rig.neutral.annotations, annotated_vertices(model.shape.mean, rig.neutral.landmarks)
-    assert notes is not None
     neutral = replace(rig.neutral, annotations=replace(notes, landmarks=at))
     as_seen = BlendshapeRig(neutral, rig.deltas, rig.names)
     errors = {True: 0.0, False: 0.0}
@@ -338,7 +337,6 @@ def test_their_variance_is_that_of_a_process_made_symmetric() -> None:
 def test_both_sides_move_alike() -> None:
     head = neutral_head(texture=False)
     twin = head.annotations.mirror
-    assert twin is not None
     modes = smooth_differences(head.vertices, head.landmarks, 1.0)
     flipped = modes[:, twin] * torch.tensor([-1.0, 1.0, 1.0])
     assert float((modes - flipped).abs().max()) < 0.02

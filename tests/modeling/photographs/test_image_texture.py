@@ -83,7 +83,6 @@ def test_painted_irises_take_a_colour_and_nothing_else_does() -> None:
 
 def test_teeth_are_darker_the_further_back_they_lie() -> None:
     head = performer(texture=False).neutral
-    assert head.annotations is not None
     teeth = torch.arange(len(head.vertices)) % 3 == 0
     head = replace(head, annotations=replace(head.annotations, regions={"teeth_upper": teeth}))
     colored = with_part_colors(replace(head, colors=torch.ones(len(head.vertices), 3)), None)

@@ -170,7 +170,6 @@ def test_blush_on_both_cheeks_stays_and_light_on_one_goes(head: Mesh) -> None:
     graph, places = VertexGraph(head.faces, len(head.vertices)), FacePlaces.of(head)
     skin, mirror = places.cheeks.double(), head.annotations.mirror
     left = (places.place - places.place.new_tensor([0.5, -0.5, 0.0]))[:, :2].norm(dim=1) < 0.25
-    assert mirror is not None
     red = torch.tensor([1.12, 1.0, 0.9])
 
     def change(where: Tensor) -> float:

@@ -121,7 +121,6 @@ def test_no_seam_shows_where_photographs_meet(subject: Mesh, skins: Tensor, text
 def test_the_hidden_side_mirrors_the_seen_one(subject: Mesh, cameras: list[Camera], lit: list[Tensor]) -> None:
     found = photo_texture(subject, lit[:1], cameras[:1], 256)
     mirror, face = subject.annotations.mirror, subject.annotations.regions["face"]
-    assert mirror is not None
     hidden = face & (found.seen == 0) & (found.seen[mirror] == 1)
     assert int(hidden.sum()) > 100
     assert float((found.colors - found.colors[mirror])[hidden].norm(dim=-1).mean()) < 0.15

@@ -156,7 +156,6 @@ def test_the_smooth_surface_passes_through_the_heads_vertices(closed: Mesh) -> N
 
 
 def test_a_head_without_contacts_is_refused(closed: Mesh) -> None:
-    assert closed.annotations is not None
     bare = replace(closed, annotations=replace(closed.annotations, contacts=None))
     with pytest.raises(ValueRangeError, match="contact pairs"):
         scan_head(bare, 0, COARSE)

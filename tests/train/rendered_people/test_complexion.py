@@ -11,7 +11,6 @@ from train.rendered_people.complexion import COMPLEXION, complexion_colors, draw
 
 def test_the_mean_is_the_painted_skin() -> None:
     mesh = neutral_head()
-    assert mesh.texture is not None
     corner = torch.zeros(len(mesh.vertices), dtype=torch.int64)
     corner[mesh.faces.flatten()] = mesh.uv_faces.flatten()
     expected = sample_texture(mesh.texture, mesh.uvs[corner].double())

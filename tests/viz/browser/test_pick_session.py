@@ -28,7 +28,6 @@ def rays_at(mesh: Mesh, ids: list[int], seed: int = 0) -> tuple[torch.Tensor, to
 def surface(session: PickSession, vertex: int) -> SurfacePoint:
     origin, direction = rays_at(session.mesh, [vertex], seed=vertex)
     found = session.on_mesh(origin[0], direction[0])
-    assert found is not None
     return found
 
 

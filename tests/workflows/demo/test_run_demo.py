@@ -58,7 +58,6 @@ def test_the_embedded_performer_comes_back_and_every_file_says_the_same(
     again = MarkerSolver(rig, result.attachment).solve_take(take).weights
     torch.testing.assert_close(again.values[..., 0].float(), single.weights, atol=5e-3, rtol=0)
     written = load_take(result.files["solved weights"]).weights
-    assert written is not None
     torch.testing.assert_close(rig.weights_from(written).float(), solved.weights, atol=1e-5, rtol=0)
 
     (solver,) = asked

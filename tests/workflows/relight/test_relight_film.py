@@ -151,8 +151,6 @@ def test_a_bare_performer_in_the_actors_place_has_teeth_and_no_hair(tmp_path: Pa
 def test_hair_painted_on_a_head_is_left_out_and_its_face_is_not() -> None:
     """A fit paints hair as a cap, which would lie on the film's forehead."""
     head = neutral_head()
-    assert head.uvs is not None
-    assert head.uv_faces is not None
     high = FacePlaces.of(head).place[:, 1]
     texels = rasterise_uvs(head.uvs, head.uv_faces, 256, 256)
     at = texels.interpolate(high[:, None], head.faces)[:, 0]

@@ -23,7 +23,6 @@ AS_IN_THE_HOW_TO = SolveSettings(align=True, clean=True, slip=True, free_scale=F
 def stage(performer_rig: BlendshapeRig) -> Capture:
     """The embedded performer with half of its shapes, 60 markers on it, and 60 frames of its weights."""
     weights = perform(60, torch.Generator().manual_seed(4)).weights
-    assert weights is not None
     return performer_rig, place_markers(performer_rig, 60), [performer_rig.weights_from(weights)]
 
 
@@ -159,7 +158,6 @@ def test_a_neutral_frame_that_moves_is_warned_of_with_the_calmest_one(shape: str
     rig = performer(texture=False)
     sites = place_markers(rig, 60)
     moving = perform(60, torch.Generator().manual_seed(4)).weights
-    assert moving is not None
     weights = 0.3 * rig.weights_from(moving)
     weights[20], weights[40] = 0.0, 0.0
     weights[40, rig.index([shape])] = level
