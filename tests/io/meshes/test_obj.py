@@ -56,8 +56,7 @@ def test_a_picture_of_the_users_beside_the_file_is_kept_each_time(scene: str, tm
     darker = replace(mesh, texture=mesh.texture / 2)
 
     def shown() -> Tensor:
-        texture = load_mesh(tmp_path / scene).texture
-        return texture
+        return load_mesh(tmp_path / scene).texture
 
     save_mesh(replace(mesh, texture=None), tmp_path / scene)
     picture.write_bytes(b"the user's")

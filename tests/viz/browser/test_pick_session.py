@@ -27,8 +27,7 @@ def rays_at(mesh: Mesh, ids: list[int], seed: int = 0) -> tuple[torch.Tensor, to
 
 def surface(session: PickSession, vertex: int) -> SurfacePoint:
     origin, direction = rays_at(session.mesh, [vertex], seed=vertex)
-    found = session.on_mesh(origin[0], direction[0])
-    return found
+    return session.on_mesh(origin[0], direction[0])
 
 
 def test_landmark_sets_mirror_like_the_face_does() -> None:
