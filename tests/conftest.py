@@ -71,7 +71,7 @@ TOGETHER = {
         "io/vrm/test_vrm_in_browser",
         "viz/browser",
         "viz/reports/test_player",
-        "workflows/live/test_page_server",
+        "workflows/live/test_page_in_chromium",
     ),
     "action units": ("capture/action_units", "train/test_action_units", "train/filmed_performers/test_camera_stage"),
 }

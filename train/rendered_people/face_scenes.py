@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from functools import cache, cached_property, lru_cache
+from functools import cache, lru_cache
 from typing import Protocol
 
 import cv2
@@ -10,17 +10,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.errors import ShapeError, ValueRangeError
+from torchface.errors import ValueRangeError
 from torchface.landmarks.images.boxes.box_training import LabelledPicture
 from torchface.landmarks.images.ibug_68 import turned_box
 
 from .scene_clutter import clutter, draw_hand, random_color
 
 _HULL = [*range(17), *range(26, 16, -1)]  # the jaw's contour, and back along the brows
-_FOUND, _DOUBTFUL = (
-    0.55,
-    0.1,
-)  # shares of a face that are seen: from the first on it is one, under the second it is none
+# Shares of a face that are seen: from the first on it is one, under the second it is none.
+_FOUND, _DOUBTFUL = 0.55, 0.1
 _SCENES, _VIEWS = 16, 8  # what is drawn once is shown so often: drawing takes longer than learning
 _WHOLE = 0.75  # of a face's box that must lie in the picture for it to count as one
 
@@ -45,41 +43,6 @@ class ScenePeople(Protocol):
     def person(self, number: int) -> np.ndarray:
         """One picture, (S,S,4), black where nobody is."""
         ...
-
-
-@dataclass(frozen=True, eq=False)
-class CutOuts:
-    """People without a background."""
-
-    pictures: Tensor  # red, green, blue, and 0 where nobody is, uint8 (N,4,S,S)
-    landmarks: Tensor  # iBUG's 68 of each, (N,68,2) pixels
-
-    def __post_init__(self) -> None:
-        count, shape = len(self.pictures), tuple(self.pictures.shape)
-        fits = (
-            len(shape) == 4
-            and shape[1] == 4
-            and shape[2] == shape[3]
-            and self.pictures.dtype == torch.uint8
-            and count > 0
-        )
-        if not fits or self.landmarks.shape != (count, 68, 2):
-            raise ShapeError(
-                f"cut-outs: found pictures {self.pictures.dtype} {shape}, landmarks {tuple(self.landmarks.shape)}; "
-                "expected uint8 (N,4,S,S) and (N,68,2)"
-            )
-
-    def __len__(self) -> int:
-        return len(self.pictures)
-
-    @cached_property
-    def faces(self) -> np.ndarray:
-        """Centre, side and roll angle of each face, (N,4)."""
-        return upright_faces(self.landmarks)
-
-    def person(self, number: int) -> np.ndarray:
-        """One picture, (S,S,4), black where nobody is."""
-        return cut_out(self.pictures[number])
 
 
 def upright_faces(landmarks: Tensor) -> np.ndarray:

@@ -1,18 +1,25 @@
-"""A film whose shades are weights, and a solver that reads them: what comes out must be what went in."""
+"""A film whose shades are weights, a solver that reads them, and who asks a session for them."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
 from torchface.capture.anybody import WebcamControls
+from torchface.errors import ValueRangeError
 from torchface.io.video import VideoFile, write_video
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.shape_names import ARKIT
 from torchface.synthetic import performer
+from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.live.live_frames import LiveFrame
+from torchface.workflows.live.live_session import LiveSession, Notes
+from torchface.workflows.live.live_view import LiveView
+from torchface.workflows.live.recordings import Recordings
+from torchface.workflows.live.weight_streams import WeightStreams
 
 JAW = ARKIT.index("jawOpen")
 SMILE = ARKIT.index("mouthSmileLeft")
@@ -93,3 +100,41 @@ class Endless:
 
     def close(self) -> None:
         """Nothing to close."""
+
+
+class Desk:
+    """One moment again and again, and what was asked."""
+
+    def __init__(self) -> None:
+        self.messages: list[Mapping[str, Any]] = []
+        self.kept: list[tuple[str, np.ndarray]] = []
+        self.number, self.closed = 0, False
+
+    def next_view(self, before: LiveView | None, seconds: float) -> LiveView | None:
+        time.sleep(0.01)
+        self.number += 1
+        weights, marks = torch.arange(52) / 52, torch.full((68, 2), 7.0)
+        gaze, beside = torch.tensor([[0.1, 0.2], [0.3, 0.4]]), torch.tensor([2.0, 0.0])
+        solved = LiveFrame(weights, FRONTAL, marks, gaze=gaze, beside=beside, calibrated=0.5)
+        picture = np.full((48, 64, 3), (200, 100, 50), np.uint8)
+        return LiveView(self.number / 100, 0.01, 9.0, picture, solved)
+
+    def state(self) -> dict[str, Any]:
+        return {"words": "here"}
+
+    def keep(self, name: str, rows: np.ndarray) -> None:
+        self.kept.append((name, rows))
+
+    def left(self) -> None:
+        self.closed = True
+
+    def asked(self, message: Mapping[str, Any]) -> None:
+        self.messages.append(message)
+        raise ValueRangeError("nobody may ask")
+
+
+def a_session(source: Endless, folder: Path, dome: Path, told: list[str]) -> tuple[LiveSession, Recordings]:
+    recordings = Recordings(folder, load_character(dome), "planted", source.video.fps)
+    streams = WeightStreams((), ARKIT, source.video.fps, told.append)
+    notes = Notes(told.append)
+    return LiveSession(source, ShadeSolver(), streams, recordings, notes, told.append), recordings

@@ -20,7 +20,7 @@ from headless_chromium import until
 from osc_receiver import values_by_address
 from received_frames import decode_frame
 
-from torchface import BlendshapeRig, load_take, save_rig
+from torchface import load_take
 from torchface.capture.anybody import WebcamControls
 from torchface.cli import main
 from torchface.io.protocols.live_link_packets import LiveLinkPackets
@@ -37,14 +37,6 @@ from torchface.workflows.live.session_prompts import STEPS
 _LIMIT = 120.0  # seconds, of a session that the phone ends before
 JAW = ARKIT.index("jawOpen")
 PICTURE = np.zeros((4, 4, 3), np.uint8)
-
-
-@pytest.fixture(scope="module")
-def dome(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A small character by ARKit's names."""
-    path = tmp_path_factory.mktemp("character") / "dome.glb"
-    save_rig(dome_rig, path)
-    return path
 
 
 def free_port() -> int:

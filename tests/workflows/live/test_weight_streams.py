@@ -109,3 +109,16 @@ def test_what_a_receiver_reports_is_said_once_each(monkeypatch: pytest.MonkeyPat
         assert streams.notes() == ("vts://h: 4 of 4 frames were not received, expected a program that listens there",)
     ends = ("not connected yet", "waits until you allow", "stream: cannot send")
     assert said == [f"vts://h: {end}; sending goes on" for end in ends]
+
+
+def test_a_receiver_that_is_not_there_is_told_once_with_the_figure() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as empty:
+        empty.bind(("127.0.0.1", 0))
+        port = empty.getsockname()[1]
+    told: list[str] = []
+    with WeightStreams((f"vmc://127.0.0.1:{port}",), ARKIT, 30.0, told.append) as streams:
+        for _ in range(5):
+            streams.send(torch.zeros(52), torch.zeros(9))
+        (note,) = streams.notes()
+    assert told == [f"vmc://127.0.0.1:{port}: nobody listens there yet; sending goes on"]
+    assert "of 5 frames were not received" in note
