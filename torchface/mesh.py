@@ -248,8 +248,8 @@ class Submesh:
 
 
 def submesh(mesh: Mesh, keep: Tensor) -> Submesh:
-    """The part of a mesh whose vertices, (V,) bool or (K,) int64, are kept in its order; so are faces of kept
-    corners."""
+    """The part of a mesh whose vertices, a mask (V,) or ids (K,), are kept, in its order; a face stays when all its
+    corners do."""
     count, device = len(mesh.vertices), mesh.vertices.device
     if keep.dtype == torch.bool:
         _check_shape("keep", keep, (count,))

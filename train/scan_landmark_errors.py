@@ -23,7 +23,6 @@ class ScanErrors:
     pixels: Tensor  # of each landmark, (L,); NaN where the truth is not known
     millimetres: Tensor  # the same in space, (L,)
     lines: dict[str, float]  # by name, mean distance in pixels of the traced points that were kept to the true line
-    stray: dict[str, float]  # by name, mean distance to the true line of all traced points
 
     @property
     def mean_pixels(self) -> float:
@@ -37,14 +36,14 @@ def landmark_errors(found: ScanLandmarks, scan: Mesh, truth: ScanAnnotation, nam
     layout, pose = found.head.layout, found.head.pose
     pixels = (found.pixels.double() - layout.pixels(pose.apply(known[None])[0])).norm(dim=-1)
     millimetres = (found.points.double() - known).norm(dim=-1)
-    lines, stray = {}, {}
+    lines = {}
     for line in LINES:
         if line in truth.lines and line in found.contours:
             path = evenly_spaced(layout.pixels(pose.apply(truth.lines[line][None].double())[0]), 400)
             contour = found.contours[line]
             distance = torch.cdist(contour.points.double(), path).amin(1)
-            lines[line], stray[line] = float(distance[contour.kept].mean()), float(distance.mean())
-    return ScanErrors(name, pixels, millimetres, lines, stray)
+            lines[line] = float(distance[contour.kept].mean())
+    return ScanErrors(name, pixels, millimetres, lines)
 
 
 def error_table(errors: Sequence[ScanErrors]) -> dict[str, float]:

@@ -43,8 +43,8 @@ PART: Mapping[Callable[..., object], Callable[..., object]] = {graph_part._opove
 
 
 def with_parts(model: onnx.ModelProto, parts: Mapping[str, onnx.ModelProto], kept: str) -> onnx.ModelProto:
-    """A graph with parts of one output each in the place of the nodes of their names; weights of ``kept`` keep
-    theirs."""
+    """A graph with parts, of one output each, in the place of the nodes of their names; weights whose names begin
+    with ``kept`` keep theirs."""
     whole = onnx.ModelProto()
     whole.CopyFrom(model)
     names = dict[str, dict[str, str]]()

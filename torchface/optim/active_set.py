@@ -28,8 +28,8 @@ _DAMPING = 1e-5
 
 
 def primal_dual_active_set(problem: BoxProblem, start: Tensor) -> tuple[Tensor, Tensor]:
-    """The minimisers (B,N) of the problems whose active set, first that of ``start``, settles, else ``start``; and
-    the gradient there."""
+    """The minimisers (B,N) of the problems whose active set, at first that of ``start``, settles, ``start`` of the
+    others; and the gradient there."""
     found, slope = start.clone(), problem.gradient(start)
     gradient = slope.clone()
     rows = torch.arange(len(start), device=start.device)

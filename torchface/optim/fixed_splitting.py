@@ -125,8 +125,8 @@ class FixedSplitting(nn.Module):
 
 
 def newton_inverse(matrix: Tensor, rho: float, doublings: int) -> Tensor:
-    r"""The inverses (B,N,N) of :math:`M + \rho I` for matrices of a unit diagonal, by products, so many doublings of
-    digits."""
+    r"""The inverses (B,N,N) of :math:`M + \rho I` for matrices of a unit diagonal, by products alone, which double
+    the digits ``doublings`` times."""
     size = matrix.shape[-1]
     identity = torch.eye(size, dtype=matrix.dtype, device=matrix.device)
     A = matrix + rho * identity

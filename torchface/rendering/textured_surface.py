@@ -37,8 +37,8 @@ class TexturedSurface:
     _made: dict[str, object] = field(default_factory=dict, init=False, repr=False)
 
     def draw(self, camera: Camera, plain: bool = False, side: float = -1.0) -> "DrawnSurface":
-        """A picture of the surface, a ray a pixel, or ``plain`` in clay; the light stands above and to a side, -1
-        the left."""
+        """A picture of the surface, a ray a pixel, in clay if ``plain``; the light stands above the camera, at its
+        left for -1, its right for 1."""
         origins, directions = (rays.reshape(-1, 3) for rays in camera.rays())
         hits, color = self.first_opaque(origins, directions, plain)
         seen = hits.triangle >= 0

@@ -93,8 +93,8 @@ def _flipped(values: Tensor, axis: str) -> Tensor:
 
 
 def scale_warnings(scale: float, held: bool, read_as: str | None = None) -> list[str]:
-    """Warnings where the scale that fits a take to its performer's rig best is not 1, though it was maybe held
-    there."""
+    """Warnings where the scale that fits a take to its performer's rig best is not 1, also of a take that is
+    ``held`` at 1."""
     if abs(scale - 1) <= MAX_SCALE_DIFFERENCE:
         return []
     unit = unit_of_scale(scale, read_as) if not MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE else ""

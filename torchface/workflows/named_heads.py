@@ -64,8 +64,8 @@ def load_head_model(name_or_path: str | Path) -> HeadModel:
 def matching(
     model: HeadModel, template: Path | None = None, part: str | None = None
 ) -> tuple[HeadModel, BlendshapeRig]:
-    """A model, and a rig, the template, else the model's, else the embedded performer, of one topology; cut to a
-    part."""
+    """A model, and the rig whose shapes its heads get, of one topology, both cut to a part: the template, else the
+    model's, else the embedded performer."""
     source, rig = "the model's own rig", model.rig
     if template is not None:
         source, rig = str(template), load_rig(template)

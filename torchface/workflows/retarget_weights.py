@@ -124,7 +124,7 @@ def _learned(
 def _mouth_closed(
     take: Take, source: BlendshapeRig | None, target: BlendshapeRig, ruled: Collection[str]
 ) -> tuple[Take, list[str]]:
-    """The take in the convention of the target's ``mouthClose``, and notes for the user; a table's shapes,
+    """The take in the convention of the target's ``mouthClose``, and notes for the user; shapes that a table drives,
     ``ruled``, stay."""
     assert take.weights is not None
     try:

@@ -158,8 +158,8 @@ def write_animation(
 ) -> KeyReduction | None:
     """Writes a rig with a take as its animation, and says how many keys that has where few were asked for.
 
-    A ``.glb`` of a rig from a ``.glb`` or ``.vrm``, ``source``, is that file, with all that it has, and the take as its
-    first animation: weights, and the rotations of head and eyes that the take has.
+    Where the rig comes from a ``.glb`` or ``.vrm``, ``source``, a ``.glb`` is that file, with all that it has, and the
+    take as its first animation: weights, and the rotations of head and eyes that the take has.
     """
     if source is None or source.suffix.lower() not in _KEPT or path.suffix.lower() != ".glb":
         return save_animation(rig, take, path, reduce=reduce).reduction

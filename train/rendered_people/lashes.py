@@ -23,7 +23,7 @@ def with_lashes(
     dense: bool,
     generator: torch.Generator,
 ) -> Tensor:
-    """Lashes of a tone, sRGB (3,), that show, or hardly, over an image (H,W,4) whose fourth channel is 1 on the person.
+    """Lashes of a tone, sRGB (3,), over an image (H,W,4) whose fourth channel is 1 on the person; ``dense`` ones show.
 
     ``distance`` is of what each pixel shows, (H,W), ``marks`` are iBUG's 68 on the head, (68,3), millimetres.
     """

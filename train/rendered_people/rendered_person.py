@@ -82,8 +82,8 @@ def render_person(
 
 
 def _finer_rays(caster: RayCaster, camera: Camera, materials: Tensor) -> tuple[Tensor, Hits, Tensor]:
-    """The pixels (N,) of four rays more through each pixel of eyes and mouths and of their edges, where what is seen
-    is small, what they hit, and their directions (N,3)."""
+    """Four rays more through each pixel of eyes and mouths and of their edges, where what is seen is small: the
+    pixels (N,), what the rays hit, their directions (N,3)."""
     small = (materials >= TEETH) & (materials <= SOCKET)
     small = torch.nn.functional.max_pool2d(small.float()[None, None], 3, 1, 1)[0, 0] > 0
     pixels = (small & (materials >= 0)).flatten().nonzero()[:, 0]
@@ -222,8 +222,8 @@ def _smooth(values: Tensor, seen: Tensor) -> Tensor:
 
 
 def visible_points(distance: Tensor, camera: Camera, points: Tensor, pixels: Tensor, behind: Tensor | float) -> Tensor:
-    """Which points (N,3) of a head, drawn at pixels (N,2), nothing at a distance (H,W) stands before, (N,) bool, but
-    what lies at most ``behind``, (N,) millimetres, less far."""
+    """Which points (N,3) of a head, drawn at pixels (N,2), nothing in a picture of distances (H,W) stands before,
+    (N,) bool; each may lie (N,) millimetres ``behind`` what is seen."""
     depth = (points - camera.centre).norm(dim=1)
     x, y = pixels[:, 0].round().long(), pixels[:, 1].round().long()
     x, y = x.clamp(0, camera.width - 1), y.clamp(0, camera.height - 1)

@@ -48,7 +48,7 @@ def draw_hand(
 ) -> None:
     """A hand with its arm, as long as ``size`` pixels without it, at ``middle``, painted into an image uint8 (H,W,3).
 
-    Fingers point right, turned clockwise by ``turn`` radians, or anywhere.
+    Its fingers' direction is turned clockwise by ``turn`` radians from pointing right; by any if absent.
     """
     skin = np.array(random_color(rng, 1.0))
     turn = rng.uniform(0, 2 * np.pi) if turn is None else turn

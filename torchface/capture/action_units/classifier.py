@@ -21,8 +21,8 @@ _MAX_CLASSES = 256  # there is a plane for every two
 
 
 class GroupClassifier(nn.Module):
-    """Gabor features of merged regions against rest, principal components, a vote of C classes, the first rest, a
-    table of levels."""
+    """Gabor features of merged regions against rest, principal components, a vote between C classes (the first is
+    rest), a table of levels."""
 
     mean: Tensor
     components: Tensor

@@ -43,8 +43,8 @@ class OneVsOne(nn.Module):
         return votes + margin / (3 * (margin.abs() + 1))
 
     def fit(self, features: Tensor, classes: Tensor, penalty: float = 1.0) -> "OneVsOne":
-        """Learns the planes from features (T,K) of classes (T,), each of which occurs; ``penalty`` is a margin
-        violation's, C."""
+        """Learns the planes from features (T,K) of classes (T,), each of which occurs; ``penalty`` is C, of a margin
+        violation."""
         count = self.first_class.shape[1]
         if features.shape != (len(classes), self.weight.shape[1]):
             raise ShapeError(

@@ -45,7 +45,7 @@ def performed_groups(labels: Sequence[ActionLabels]) -> tuple[RegionGroup, ...]:
 
 
 def region_grid(boxes: Mapping[str, Box], names: Sequence[str], size: int, width: int, height: int) -> Tensor:
-    """The pixels of a neutral image at which regions, boxes of left, top, right, bottom, are read, (R,size,size,2)."""
+    """The pixels (R,size,size,2) of a neutral image at which regions in boxes (left, top, right, bottom) are read."""
     lacking = [name for name in names if name not in boxes]
     if lacking:
         raise NameMismatchError(f"regions: found no {', '.join(lacking)}, expected {', '.join(names)}")

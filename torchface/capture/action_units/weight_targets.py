@@ -118,8 +118,8 @@ def action_unit_curves(
 def smooth_intensities(
     intensities: Tensor, units: Sequence[str], windows: Mapping[str, int] = WINDOWS, fps: float = _RATE
 ) -> Tensor:
-    """A classifier's levels (T,A) as continuous curves in [0,1], Savitzky and Golay's over windows in frames at 60 a
-    second.
+    """A classifier's levels (T,A) as continuous curves in [0,1], by Savitzky and Golay's filter with windows of frames
+    at 60 a second.
 
     Source: thesis 4.1.12.
     """

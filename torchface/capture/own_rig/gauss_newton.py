@@ -125,8 +125,8 @@ def linearise(
 
 
 def sliding(lines: Tensor, pixels: Tensor, along: float) -> Tensor:
-    """Offsets of landmarks (B,68,2,K), or their derivatives, in which those of the contour count ``along`` of it
-    less than across."""
+    """Offsets of landmarks (B,68,2,K), or their derivatives, in which those of the contour count less along it than
+    across it: ``along``, 0 to 1, times as much."""
     if along >= 1:
         return lines
     contour, jaw = lines[:, :JAW], pixels[:, :JAW]

@@ -187,8 +187,8 @@ def _without_pose(offsets: LandmarkOffsets, rest: Tensor, likely: Tensor) -> Lan
 def _split(
     mean: _Mean, before: LandmarkOffsets, expression: Tensor | None, likely: Tensor, solver: VideoSolver | None
 ) -> tuple[LandmarkOffsets, Tensor]:
-    """The mean residual as offsets and a constant expression, (N,), none without a solver; their covariance is
-    (204,204)."""
+    """The mean residual as offsets, of likely covariance (204,204), and a constant expression, (N,), none without a
+    solver."""
     count = len(mean.weights)
     here = torch.cat([mean.weights, before.millimetres.flatten()])
     f = mean.gradient - mean.H @ here

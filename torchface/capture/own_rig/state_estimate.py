@@ -21,7 +21,7 @@ class StateEstimate:
     covariance: Tensor  # of weights, rotation and translation in the camera's frame, (B,N+6,N+6)
 
     def predicted(self, steps: Tensor, variance: Tensor, motion_variance: Tensor) -> "StateEstimate":
-        """One frame on, by steps (B,N) of the weights of a variance (B,N) and a motion of the head of a variance
+        """One frame on, by expected steps (B,N) of the weights, their variance (B,N), and that of the head's motion,
         (6,)."""
         noise = torch.cat([variance, motion_variance.expand(len(variance), 6)], dim=1)
         mean = HeadState(self.mean.weights + steps, self.mean.rotation, self.mean.translation)

@@ -50,7 +50,7 @@ class TakeWindows:
         return FOLDS if len(self.takes) == 1 else min(len(self.takes), _MOST_FOLDS)
 
     def parts(self, generator: torch.Generator | None = None) -> Iterator[Part]:
-        """One after the other; ``generator`` is of the noise, where draws are to go on after the last part."""
+        """One after the other; where draws are to go on after the last part ``generator`` draws the noise."""
         generator = torch.Generator().manual_seed(self.seed) if generator is None else generator
         begin = 0
         for number, take in enumerate(self.takes):

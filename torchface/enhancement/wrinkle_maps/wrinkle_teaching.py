@@ -39,9 +39,8 @@ def captured_poses(model: EnhancementModel, shapes: Tensor) -> Tensor:
 
 
 def teaching_poses(captured: Tensor, areas_moved: Tensor, count: int) -> Tensor:
-    """Poses that weights are learned from, at least one a shape and some of the actor's (K,N), (count,N): each shape
-    alone; the actor's, evenly picked; half of the rest are mixtures of two, region by region, by how much each shape
-    moves each (R,N)."""
+    """Poses (count,N) that weights are learned from: each shape alone; then the actor's own (K,N), evenly picked;
+    half of the rest are mixtures of two of them, region by region, as far as each shape moves it (R,N)."""
     generator = torch.Generator().manual_seed(0)
     shapes = captured.shape[1]
     left = max(0, count - shapes)

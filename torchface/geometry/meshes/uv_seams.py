@@ -24,8 +24,8 @@ def split_at_seams(
     uv_faces: NDArray[np.int64] | None,
     mirrored: NDArray[np.bool_] | None = None,
 ) -> Split:
-    """Vertices with one texture coordinate each, and one orientation of the texture where corners (F,3) say it is
-    mirrored."""
+    """Vertices with one texture coordinate each; one with corners (F,3) on both sides of a mirrored texture gets two
+    rows."""
     if uv_faces is None:
         return Split(np.arange(vertex_count), None, faces)
     keys = uv_faces * vertex_count + faces

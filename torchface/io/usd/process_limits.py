@@ -13,8 +13,8 @@ _PR_SET_PDEATHSIG = 1  # of Linux
 
 
 def limit_growth(start: int, size: int) -> None:
-    """Ends this process's growth from ``start`` bytes of addresses at what files of ``size`` bytes may take of
-    everything."""
+    """Limits the memory, time and output of this process, of ``start`` bytes of addresses now, to what files of
+    ``size`` bytes may take."""
     if sys.platform == "win32":  # no such limits there
         return
     import resource

@@ -38,8 +38,8 @@ class LineShape:
     def fit(
         lines: Sequence[Tensor], images: Sequence[Tensor] | None = None, corner_deviation: float = 0.0
     ) -> "LineShape":
-        """The mean course of pixel lines, two at least, each (N,2) from its left to its right corner; the profile of
-        images (C,S,S)."""
+        """The mean course of pixel lines, two at least, each (N,2) from its left to its right corner; with images
+        (C,S,S) the profile too."""
         rows = torch.stack([_offsets(line.double()) for line in lines])
         shape = LineShape(rows.mean(0), rows.std(0).clamp(min=_MIN_DEVIATION), corner_deviation)
         if images is None:

@@ -48,7 +48,8 @@ class Opening:
 def eye_opening(vertices: Tensor, skin: Tensor, middle: Tensor, span: float) -> Opening | None:
     """The opening of an eye, seen from the front; none where the skin is whole there, as of closed or painted eyes.
 
-    Vertices (V,3) of an upright head look along z; skin (F,3) has no eyeballs and lashes; the picture spans two eyes.
+    Vertices (V,3) are of an upright head that looks along z, skin (F,3) is without eyeballs and lashes; the picture's
+    ``span`` is about twice an eye's width.
     """
     camera = look_at(middle, 0.0, 0.0, span, _SIDE, _SIDE)
     origins, directions = (rays.reshape(-1, 3) for rays in camera.rays())

@@ -76,7 +76,8 @@ class FaceOnSurface:
 
 
 class NoFaceOnSurfaceError(AlignmentError):
-    """A surface shows no face; ``likeness`` is that of one in pictures whose form is none, the score from afar."""
+    """A surface shows no face; ``likeness`` is the score, from afar, of a face that pictures show though its form is
+    none."""
 
     def __init__(self, message: str, views: Sequence[Tensor], likeness: float = 0.0) -> None:
         super().__init__(message)
@@ -96,8 +97,8 @@ class FaceSearch:
     def find(
         self, surface: TexturedSurface, framed: Tensor | None = None, progress: Progress | None = None
     ) -> FaceOnSurface:
-        """The face on a surface, of any unit and turn: the one that most pictures, round vertices ``framed`` (V,),
-        show."""
+        """The face on a surface of any unit and turn: the one that most pictures show; they frame the vertices
+        ``framed`` (V,)."""
         progress = progress or silent
         pictures: list[Tensor] = []
         refused: NoFaceOnSurfaceError | None = None
@@ -345,7 +346,8 @@ def _together(points: Sequence[Tensor], weights: Sequence[Tensor], astray: float
 
 
 def _through_holes(reference: Tensor, points: Tensor, landmarks: Tensor) -> Tensor:
-    """Which points (N,), in place of ``reference`` (N,3), lie so far behind a face that they are seen through holes."""
+    """Which points (N,) of eyes and mouth lie so far behind a face that they are seen through holes; a head has them
+    at ``reference`` (N,3)."""
     eyes = (landmarks[_EYES[0]] - landmarks[_EYES[1]]).norm()
     openings = torch.stack([landmarks[one].double().mean(0) for one in _OPENINGS])
     near = torch.cdist(reference, openings).amin(1) < _AROUND_OPENING * eyes

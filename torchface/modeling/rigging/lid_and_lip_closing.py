@@ -41,7 +41,7 @@ class Seams:
 
 
 def find_seams(rig: BlendshapeRig, moving: Tensor) -> Seams:
-    """The seams of a rig whose shapes move vertices (N,V) bool."""
+    """The seams of a rig; ``moving`` (N,V) says which vertices each shape moves."""
     neutral = rig.neutral
     vertices, deltas = neutral.vertices.detach().double().cpu(), rig.deltas.detach().double().cpu()
     named = None if neutral.annotations is None else neutral.annotations.contacts

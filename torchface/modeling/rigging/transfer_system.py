@@ -222,8 +222,8 @@ class Follower:
     system: PreparedReconstruction  # factored once, for the iterations to come
 
     def follow(self, gradients: Tensor, values: Sequence[Tensor]) -> Tensor:
-        """Displacements (G,V,3), by what is added to the gradients (G,F,3,3) and what the matrices measure more
-        (G,K,3), mm."""
+        """Displacements (G,V,3), mm, where ``gradients`` (G,F,3,3) are added to the target's and ``values`` (G,K,3)
+        to what the matrices measure."""
         none = torch.zeros(len(gradients), self.system.vertex_count, 3, dtype=torch.float64)
         return self.system.solve(gradients, none, values)
 

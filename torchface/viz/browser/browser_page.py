@@ -166,8 +166,8 @@ _SAME = 5e-4
 
 
 class SharedInput:
-    """A slider, dropdown or checkbox of the page, which distinguishes changes by the user, on which it acts, from
-    the program's."""
+    """A slider, dropdown or checkbox of the page, which distinguishes the user's changes, after which ``act`` is
+    called, from the program's."""
 
     def __init__(self, handle: Any, lock: AbstractContextManager, act: Callable[[Any], Any]) -> None:
         self.handle = handle

@@ -139,8 +139,8 @@ class HeadOnPage:
         return sent
 
     def settle(self, calls: int = 1) -> None:
-        """Shows the texture, where the head has one that is not shown; one with wrinkles, which the page reads
-        first, ``calls`` later."""
+        """Shows the texture, where the head has one that is not shown; one with wrinkles, which the page has to
+        read, after so many calls more."""
         if self.settled:
             return
         with self._server.atomic():

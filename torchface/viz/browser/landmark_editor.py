@@ -48,8 +48,8 @@ _LINES = (
 class LandmarkEditor(BrowserPage):
     """Frames in the browser, their landmarks to be dragged.
 
-    A dot is dragged, or chosen by a click; a click on the image brings the chosen one there. *Save* writes the
-    frame's files and switches to the next.
+    A dot is dragged, or chosen by a click; a click on the image brings the chosen one there. *Save* writes the frame's
+    files and switches to the next.
     """
 
     def __init__(self, session: AnnotationSession, label: str = "torchface annotate", port: int = 8080) -> None:

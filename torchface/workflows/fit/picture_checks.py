@@ -52,8 +52,8 @@ _PARTS = {"nose": slice(27, 36), "mouth": slice(48, 68)}
 
 
 def picture_lines(found: PhotographLandmarks, insist: bool = False) -> list[str]:
-    """What speaks against a photograph, for people to read, refused or, insisted on, not; nothing where it shows one
-    face well."""
+    """What speaks against a photograph, for people to read; nothing where it shows one face well. With ``insist``
+    nothing is refused."""
     face, name = found.face, found.photograph.name
     eyes = float((face.landmarks[36] - face.landmarks[45]).norm())
     hidden = _hidden_parts(found)

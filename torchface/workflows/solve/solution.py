@@ -192,8 +192,8 @@ def solve_markers(
     predicted: Predicted | None = None,
     progress: Progress | None = None,
 ) -> Solution:
-    """A take's weights: aligned with the rig, cleaned, freed of slip and of what is left at rest, solved, maybe with
-    what a head camera predicted."""
+    """A take's weights: aligned with the rig, cleaned, freed of slip and of what is left at rest, solved, with what
+    a head camera predicted if given."""
     progress = progress or silent
     whole = predicted is None and not settings.frame_by_frame
     warnings = check_coverage(attachment, take, len(rig.names), settings.insist).warnings()

@@ -87,7 +87,7 @@ def check_coverage(attachment: Attachment, take: Take, shapes: int, insist: bool
 
 
 def check_explained(solver: MarkerSolver, take: Take, aligned: bool, slip: bool, insist: bool = False) -> FitCheck:
-    """How well a rig explains a take's markers, in rig space and known to the solver; insisted on, nothing is
+    """How well a rig explains a take's markers, in rig space and known to the solver; with ``insist`` nothing is
     refused."""
     assert take.markers is not None
     markers = solver.arrange(take.markers).double()

@@ -191,8 +191,8 @@ _TO_END = 2.0  # seconds that a process has to end once nothing more comes in
 
 
 class AnsweringProcess:
-    """A process whose requests go in at its standard input and whose answers come out at its output; or else
-    ``error``."""
+    """A process whose requests go in at its standard input and whose answers come out at its output; ``error`` is
+    raised where it fails."""
 
     def __init__(
         self,

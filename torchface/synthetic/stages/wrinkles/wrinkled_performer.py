@@ -35,8 +35,8 @@ def steady_folding(compression: Tensor, scale: Tensor, trace: Tensor) -> Tensor:
 
 
 def with_lag(folding: Tensor, fps: float, fold_time: float, unfold_time: float) -> Tensor:
-    """Folding (T,G) as skin shows it: a first-order low-pass, fast as it folds and slow as it unfolds, of times in
-    seconds."""
+    """Folding (T,G) as skin shows it: a first-order low-pass, fast as it folds and slow as it unfolds; time
+    constants in seconds."""
     fold, unfold = (1 - math.exp(-1 / (fps * time)) for time in (fold_time, unfold_time))
     shown = torch.empty_like(folding)
     shown[:1] = folding[:1]
