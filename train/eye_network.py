@@ -16,9 +16,10 @@ from torchface.landmarks.images.networks.eye_augmentation import EyeAugmentation
 from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.landmarks.images.networks.eye_training import EyeSettings
 
-from .eye_pictures import EACH, PART, StoredEyePictures, eye_picture_files
+from .eye_pictures import EACH, EYES, PART, StoredEyePictures
 from .model_cards import model_card
 from .recipe_settings import RenderedSettings
+from .rendered_files import rendered_files
 from .runner import Recipe, Run, recipe
 
 _TEST_BATCH = 100
@@ -46,8 +47,8 @@ def train(settings: Settings, run: Run) -> EyeNetwork:
     """Renders, trains, evaluates and saves."""
     progress = run.progress
     settings.check_count(PART)
-    files = eye_picture_files(
-        settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, progress
+    files = rendered_files(
+        EYES, settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, progress
     )
     held_out = EACH * -(-settings.held_out // EACH)  # whole people
     learned = StoredEyePictures(files, held_out)

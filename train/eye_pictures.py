@@ -9,10 +9,9 @@ from torch import Tensor
 from torch.utils.data import Dataset
 
 from torchface.landmarks.images.networks.eye_augmentation import EyeLabels
-from torchface.progress import Progress
 
 from .face_pictures import head_kinds
-from .rendered_files import Rendering, rendered_files
+from .rendered_files import Rendering
 from .rendered_people.eye_picture import draw_eye_pictures
 from .tensor_shards import Shards
 
@@ -64,15 +63,11 @@ class StoredEyePictures(Dataset[tuple[Tensor, ...]]):
         return some.rgba, *vars(some.labels).values()
 
 
-def eye_picture_files(
-    folder: Path, count: int, seed: int, ict: Path | None = None, workers: int = 1, progress: Progress | None = None
-) -> list[Path]:
-    """Renders what a folder does not hold yet, :data:`PART` pictures a file; see ``rendered_files``."""
-    rendering = Rendering(_render, "eye pictures/4", "eyes", "eyes", PART)
-    return rendered_files(rendering, folder, count, seed, ict, workers, progress)
-
-
 def _render(first: int, count: int, seed: int, ict: Path | None) -> dict[str, Tensor]:
     pictures = draw_eye_pictures(*head_kinds(ict), first, count, seed, EACH)
     names = [field.name for field in fields(EyePictures)]
     return {name: torch.stack([getattr(picture, name) for picture in pictures]) for name in names}
+
+
+EYES = Rendering(_render, "eye pictures/4", "eyes", "eyes", PART)
+"""How they are rendered, see ``rendered_files``."""

@@ -20,9 +20,10 @@ from torchface.landmarks.images.boxes.box_training import Pictures
 from torchface.landmarks.images.boxes.face_box import overlaps
 from torchface.progress import Progress, silent
 
-from .face_pictures import EACH, StoredCutOuts, StoredPictures, picture_files
+from .face_pictures import EACH, FACES, StoredCutOuts, StoredPictures
 from .model_cards import model_card
 from .recipe_settings import ANY_DEVICE, RecipeSettings
+from .rendered_files import rendered_files
 from .rendered_people.face_scenes import ScenePeople, SceneSettings, empty_scene, face_scene
 from .rendered_people.scene_clutter import clutter
 from .runner import Recipe, Run, metric_lines, recipe
@@ -74,7 +75,9 @@ def train(settings: Settings, run: Run) -> tuple[BoxNetwork, dict[str, float]]:
             f"found --held-out {settings.held_out} of --people {settings.people}, --tested {settings.tested}; expected "
             "some of the people, not all, and 1 at least"
         )
-    files = picture_files(settings.folder, settings.people, settings.seed, settings.ict, settings.workers, progress)
+    files = rendered_files(
+        FACES, settings.folder, settings.people, settings.seed, settings.ict, settings.workers, progress
+    )
     split = EACH * ((len(StoredPictures(files)) - settings.held_out) // EACH)  # whole people
     people, others = StoredCutOuts(files, 0, split), StoredCutOuts(files, split)
     progress(f"{len(people)} pictures of people to learn from, {len(others)} to test on")

@@ -16,8 +16,9 @@ from torchface.landmarks.images.networks.part_network import PARTS, PartNetwork
 from torchface.landmarks.images.networks.part_training import PartSettings, part_crops
 
 from .model_cards import model_card
-from .part_pictures import EACH, PART, SCENES, StoredPartPictures, part_picture_files
+from .part_pictures import EACH, PART, PARTS_OF_FACES, SCENES, StoredPartPictures
 from .recipe_settings import RenderedSettings
+from .rendered_files import rendered_files
 from .runner import Recipe, Run, recipe
 
 _TEST_BATCH = 48
@@ -45,8 +46,8 @@ def train(settings: Settings, run: Run) -> PartNetwork:
     """Renders, trains, evaluates and saves."""
     settings.check_count(PART)
     first = None if settings.start is None else zoo.get_model(settings.start, PartNetwork)
-    files = part_picture_files(
-        settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, run.progress
+    files = rendered_files(
+        PARTS_OF_FACES, settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, run.progress
     )
     people = EACH * SCENES
     held_out = people * -(-settings.held_out // people)  # whole people

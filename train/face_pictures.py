@@ -11,10 +11,9 @@ from torch.utils.data import Dataset
 
 from torchface.errors import FileFormatError
 from torchface.io import load_ict_facekit, load_identity_modes
-from torchface.progress import Progress
 from torchface.shape_names import ARKIT
 
-from .rendered_files import Rendering, rendered_files
+from .rendered_files import Rendering
 from .rendered_people.dense_points import COUNT as POINTS
 from .rendered_people.face_picture import draw_pictures
 from .rendered_people.face_scenes import cut_out, upright_faces
@@ -85,17 +84,13 @@ class StoredCutOuts:
         return cut_out(self._pictures[torch.tensor([self._begin + number])][0][0])
 
 
-def picture_files(
-    folder: Path, count: int, seed: int, ict: Path | None = None, workers: int = 1, progress: Progress | None = None
-) -> list[Path]:
-    """Renders what a folder does not hold yet, :data:`PART` pictures a file; see ``rendered_files``."""
-    rendering = Rendering(_render, "face pictures/7", "pictures", "faces", PART)
-    return rendered_files(rendering, folder, count, seed, ict, workers, progress)
-
-
 def _render(first: int, count: int, seed: int, ict: Path | None) -> dict[str, Tensor]:
     pictures = draw_pictures(*head_kinds(ict), first, count, seed, EACH)
     return {name: torch.stack([getattr(picture, name) for picture in pictures]) for name in _TENSORS + _POINTS}
+
+
+FACES = Rendering(_render, "face pictures/7", "pictures", "faces", PART)
+"""How they are rendered, see ``rendered_files``."""
 
 
 @lru_cache(maxsize=2)

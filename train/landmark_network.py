@@ -23,9 +23,10 @@ from torchface.landmarks.images.networks.landmark_training import cropped, openi
 from torchface.landmarks.images.networks.picture_augmentation import AugmentationSettings, Crops
 
 from .annotated_pictures import annotated_pictures, inner_error
-from .face_pictures import EACH, PART, StoredExpressions, picture_files
+from .face_pictures import EACH, FACES, PART, StoredExpressions
 from .model_cards import model_card
 from .recipe_settings import RenderedSettings
+from .rendered_files import rendered_files
 from .rendered_people.dense_points import dense_places
 from .runner import Recipe, Run, metric_lines, recipe
 
@@ -75,7 +76,9 @@ def train(settings: Settings, run: Run) -> LandmarkNetwork:
         raise ValueRangeError(f"--kept: found {settings.kept:g}, expected [0,1), and 0 without --start")
     first = first_network(settings)
     before = {name: value.clone() for name, value in first.state_dict().items()}
-    files = picture_files(settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, progress)
+    files = rendered_files(
+        FACES, settings.folder, settings.pictures, settings.seed, settings.ict, settings.workers, progress
+    )
     pictures = StoredExpressions(files)
     count = EACH * ((len(pictures) - settings.held_out) // EACH)  # whole people
     learned = StoredExpressions(files, count)

@@ -7,10 +7,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import Dataset
 
-from torchface.progress import Progress
-
 from .face_pictures import head_kinds
-from .rendered_files import Rendering, rendered_files
+from .rendered_files import Rendering
 from .rendered_people.part_picture import PartPicture, draw_part_pictures
 from .tensor_shards import Shards
 
@@ -36,14 +34,10 @@ class StoredPartPictures(Dataset[tuple[Tensor, ...]]):
         return tuple(rows[name] for name in _NAMES)
 
 
-def part_picture_files(
-    folder: Path, count: int, seed: int, ict: Path | None = None, workers: int = 1, progress: Progress | None = None
-) -> list[Path]:
-    """Renders what a folder does not hold yet; see ``rendered_files``."""
-    rendering = Rendering(_render, "part pictures/2", "pictures", "faces and their parts", PART)
-    return rendered_files(rendering, folder, count, seed, ict, workers, progress)
-
-
 def _render(first: int, count: int, seed: int, ict: Path | None) -> dict[str, Tensor]:
     pictures = draw_part_pictures(*head_kinds(ict), first, count, seed, EACH, SCENES)
     return {name: torch.stack([getattr(picture, name) for picture in pictures]) for name in _NAMES}
+
+
+PARTS_OF_FACES = Rendering(_render, "part pictures/2", "pictures", "faces and their parts", PART)
+"""How they are rendered, see ``rendered_files``."""

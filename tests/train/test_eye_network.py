@@ -13,11 +13,12 @@ from torchface.landmarks.images.networks.eye_training import EyeSettings
 from train import eye_network as recipe
 from train.eye_network import Settings, train
 from train.eye_pictures import EyePictures
+from train.rendered_files import Rendering
 from train.rendered_people.eye_picture import draw_eye_pictures
 from train.rendered_people.head_kind import performer_kind
 
 
-def drawn(folder: Path, *_: object) -> list[Path]:
+def drawn(_: Rendering, folder: Path, *more: object) -> list[Path]:
     """A file of eight pictures, of which the first four are held out."""
     pictures = draw_eye_pictures((performer_kind(),), (1.0,), 0, 8, seed=3, each=4)
     names = [field.name for field in fields(EyePictures)]
@@ -26,7 +27,7 @@ def drawn(folder: Path, *_: object) -> list[Path]:
 
 
 def test_what_is_saved_is_what_was_learned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recipe, "eye_picture_files", drawn)
+    monkeypatch.setattr(recipe, "rendered_files", drawn)
     monkeypatch.setattr(recipe, "EACH", 4)
     monkeypatch.setattr(recipe, "PART", 4)
     out = tmp_path / "eyes"

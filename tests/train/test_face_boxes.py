@@ -11,10 +11,11 @@ from torchface import TorchfaceError, zoo
 from torchface.landmarks import BoxNetwork, BoxTrainingSettings
 from train import face_boxes as recipe
 from train.face_boxes import Settings, mined_pieces, train
+from train.rendered_files import Rendering
 from train.rendered_people.face_scenes import SceneSettings, empty_scene
 
 
-def planted(folder: Path, *_: object) -> list[Path]:
+def planted(_: Rendering, folder: Path, *more: object) -> list[Path]:
     """A file of ten cut-outs of noise with landmarks anywhere."""
     generator = torch.Generator().manual_seed(1)
     rgba = torch.randint(1, 255, (10, 4, 48, 48), generator=generator, dtype=torch.uint8)
@@ -24,7 +25,7 @@ def planted(folder: Path, *_: object) -> list[Path]:
 
 
 def test_what_is_saved_is_what_was_learned(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(recipe, "picture_files", planted)
+    monkeypatch.setattr(recipe, "rendered_files", planted)
     monkeypatch.setattr(recipe, "EACH", 1)
     learning = BoxTrainingSettings(2, 8, channels=(8, 8, 8, 8), blocks=(1, 1, 1, 1))
     out = tmp_path / "boxes"

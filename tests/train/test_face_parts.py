@@ -38,7 +38,7 @@ def test_what_is_saved_is_what_was_learned(
     pictures: list[PartPicture], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     save_file({name: torch.stack([getattr(one, name) for one in pictures]) for name in NAMES}, tmp_path / "some")
-    monkeypatch.setattr(recipe, "part_picture_files", lambda *_: [tmp_path / "some"])
+    monkeypatch.setattr(recipe, "rendered_files", lambda *_: [tmp_path / "some"])
     for name, count in (("EACH", 1), ("SCENES", 2), ("PART", 2)):
         monkeypatch.setattr(recipe, name, count)
     out = tmp_path / "parts"

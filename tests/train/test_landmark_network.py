@@ -73,7 +73,7 @@ def test_files_give_what_memory_gives(files: list[Path], workers: int) -> None:
 def test_the_recipe(files: list[Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recipe, "PART", 3)
     monkeypatch.setattr(recipe, "EACH", 2)
-    monkeypatch.setattr(recipe, "picture_files", lambda *_: files)
+    monkeypatch.setattr(recipe, "rendered_files", lambda *_: files)
     zoo.save_model(small(), tmp_path / "start", zoo.ModelCard("MIT", "none", {}, ""))
     settings = recipe.Settings(
         out=tmp_path / "own", pictures=6, held_out=3, start=str(tmp_path / "start"), size=64, network=QUICK
