@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from planted.photographed_heads import aligned_error
 from torchface import Attachment
 from torchface.geometry.cameras.pnp import Pose, solve_pnp
 from torchface.geometry.rotations import rotation_matrix
-from torchface.geometry.similarity import similarity_transform
 from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images
 from torchface.modeling.photographs.fit_problem import Problem, State, whitening
 from torchface.modeling.photographs.image_fit import contour_curves
@@ -134,11 +134,6 @@ def planted(faces: Faces, seed: int, slides: bool, yaws: tuple[float, ...] = POR
     return Planted(rest, face, pixels + noise, focal)
 
 
-def error(found: Tensor, true: Tensor) -> float:
-    moved = similarity_transform(found[None].double(), true[None].double()).apply(found[None].double())[0]
-    return float((moved - true.double()).norm(dim=-1).mean())
-
-
 def lip_gap(vertices: Tensor, rig: BlendshapeRig) -> float:
     upper, lower = rig.neutral.landmarks[61:64], rig.neutral.landmarks[[67, 66, 65]]
     return float((vertices[upper] - vertices[lower]).norm(dim=-1).mean())
@@ -155,9 +150,9 @@ class Row:
     seconds: float = 0.0
 
     def add(self, fit: ImageFit, truth: Planted, rig: BlendshapeRig, seconds: float) -> None:
-        self.error += error(fit.mesh.vertices, truth.rest)
-        self.mean += error(rig.vertices, truth.rest)
-        self.posed += error(fit.posed[0].vertices, truth.face)
+        self.error += aligned_error(fit.mesh.vertices, truth.rest)
+        self.mean += aligned_error(rig.vertices, truth.rest)
+        self.posed += aligned_error(fit.posed[0].vertices, truth.face)
         self.gaps += (lip_gap(fit.posed[0].vertices, rig) - lip_gap(truth.face, rig),)
         self.seconds += seconds
 

@@ -23,13 +23,13 @@ from image_fit_cases import (
     Faces,
     Row,
     alternate,
-    error,
     lip_gap,
     planted,
     table,
 )
 from torch import Tensor
 
+from planted.photographed_heads import aligned_error
 from torchface import zoo
 from torchface.geometry.cameras.pnp import solve_pnp
 from torchface.io.images.image_files import load_image
@@ -105,9 +105,9 @@ def test_joint_steps_against_turns(faces: Faces, focal: float | None) -> None:
             found = state.coefficients.float()
             rest = faces.rig.vertices + torch.tensordot(found[:20], faces.modes, dims=1)
             face = rest + torch.tensordot(found[20:], faces.rig.deltas, dims=1)
-            row.error += error(rest, truth.rest)
-            row.mean += error(faces.rig.vertices, truth.rest)
-            row.posed += error(face, truth.face)
+            row.error += aligned_error(rest, truth.rest)
+            row.mean += aligned_error(faces.rig.vertices, truth.rest)
+            row.posed += aligned_error(face, truth.face)
             row.gaps += (lip_gap(face, faces.rig) - lip_gap(truth.face, faces.rig),)
             row.seconds += spent
     print(f"\njoint Gauss-Newton and the thesis's turns, focal length {focal or 'known'}\n{HEADING}")
@@ -298,9 +298,9 @@ def test_planted_single_views_beside_eos(faces: Faces) -> None:
         settings = FitSettings(focal_deviation=SPREAD)
         fit = fit_images(model, faces.rig, truth.landmarks, SIZE, camera=FOCAL, settings=replace(settings, transfers=0))
         _, _, posed = peer.fit(truth.landmarks[0], *SIZE, 0)
-        ours.append(error(fit.posed[0].vertices, truth.face))
-        theirs.append(error(posed, truth.face))
-        mean.append(error(faces.rig.vertices, truth.face))
+        ours.append(aligned_error(fit.posed[0].vertices, truth.face))
+        theirs.append(aligned_error(posed, truth.face))
+        mean.append(aligned_error(faces.rig.vertices, truth.face))
     rows = {"torchface": ours, "eos": theirs, "the mean face at rest": mean}
     print("\nposed face, one view at 20°, millimetres")
     for name, values in rows.items():

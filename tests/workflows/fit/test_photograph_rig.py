@@ -8,6 +8,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
+from planted.photographed_heads import aligned_error
 from torchface import load_rig, save_rig, zoo
 from torchface.cli import main
 from torchface.color_space import to_linear
@@ -20,7 +21,6 @@ from torchface.errors import (
     ValueRangeError,
 )
 from torchface.geometry.cameras.pinhole import look_at
-from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_identity_modes
 from torchface.io.camera_files import load_calibration
 from torchface.io.images.image_files import load_image, save_image
@@ -71,11 +71,6 @@ def studio(tmp_path_factory: pytest.TempPathFactory, actor: BlendshapeRig) -> Pa
         rows = "\n".join(f"{x:.3f} {y:.3f}" for x, y in marks.tolist())
         (folder / f"p{i}.pts").write_text(f"version: 1\nn_points: 68\n{{\n{rows}\n}}\n")
     return folder
-
-
-def aligned_error(found: Tensor, true: Tensor) -> float:
-    moved = similarity_transform(found[None].double(), true[None].double()).apply(found[None].double())[0]
-    return float((moved - true.double()).norm(dim=-1).mean())
 
 
 def test_the_command_makes_the_actors_rig(

@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from planted.photographed_heads import aligned_error
 from torchface import load_rig, save_rig
 from torchface.errors import TopologyError
 from torchface.geometry.cameras.calibration import assumed_calibration
@@ -20,11 +21,6 @@ from torchface.workflows.track.track_video import track_video
 
 COUNT, WIDTH, HEIGHT = 12, 640, 480
 SHAPES = ["jawOpen", "mouthSmileLeft", "mouthSmileRight", "browInnerUp"]
-
-
-def from_the_truth(found: Tensor, true: Tensor) -> float:
-    moved = similarity_transform(found[None].double(), true[None].double()).apply(found[None].double())[0]
-    return float((moved - true.double()).norm(dim=-1).mean())
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +58,7 @@ def test_the_head_is_solved_with_the_take(actor: BlendshapeRig, take: tuple[Path
     assert made.names == actor.names
     skin = actor.neutral.annotations.regions["face"]
     true = actor.vertices[skin]
-    assert from_the_truth(made.vertices[skin], true) < 0.6 * from_the_truth(mean.vertices[skin], true)
+    assert aligned_error(made.vertices[skin], true) < 0.6 * aligned_error(mean.vertices[skin], true)
     ahead = similarity_transform(*(one.vertices[mean.neutral.landmarks][None].double() for one in (made, mean)))
     assert float(ahead.rotation[0].diagonal().sum()) > 3 - 1e-6  # it stands as the mean head, else gaze is off
     for camera, posed, seen in zip(
