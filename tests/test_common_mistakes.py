@@ -69,6 +69,10 @@ MISTAKES: dict[str, tuple[Callable[[Given], Any], str]] = {
     "points of two numbers": (lambda g: Mesh(g.v[:, :2], g.f), r"vertices: found \(\d+, 2\), expected"),
     "a tensor for a neutral": (lambda g: BlendshapeRig(g.v, g.d, g.rig.names), "neutral: found a tensor .* a Mesh"),
     "a path for a neutral": (lambda g: BlendshapeRig("a.glb", g.d, "x"), "neutral: .*torchface.load_mesh reads one"),
+    "a region for a part": (
+        lambda g: g.rig.part("face"),
+        r"keep: found the text 'face', .*annotations.regions\['face'\]",
+    ),
     "one name as a text": (lambda g: BlendshapeRig(g.mesh, g.d[:1], "jawOpen"), r"expected a list of names: \['jaw"),
     "too few names": (lambda g: BlendshapeRig(g.mesh, g.d, ["a"]), "found 1 names for 4 deltas"),
     "weights by name": (lambda g: g.rig({"jawOpen": 1.0}), r"weights: found a dict, expected a tensor \(B,4\)"),

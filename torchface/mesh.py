@@ -251,6 +251,7 @@ def submesh(mesh: Mesh, keep: Tensor) -> Submesh:
     """The part of a mesh whose vertices, a mask (V,) or ids (K,), are kept, in its order; a face stays when all its
     corners do."""
     count, device = len(mesh.vertices), mesh.vertices.device
+    keep = as_tensor("keep", keep, "(V,) bool or (K,) int64, such as mesh.annotations.regions['face']")
     if keep.dtype == torch.bool:
         _check_shape("keep", keep, (count,))
     else:
