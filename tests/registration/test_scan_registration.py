@@ -78,6 +78,16 @@ def test_without_landmarks_the_copy_is_found_too(mask: Mesh, moved) -> None:
     assert float(error(result, copy.vertices).max()) < 0.3
 
 
+def test_a_second_head_on_the_scan_is_named(mask: Mesh) -> None:
+    apart = torch.tensor([400.0, 30.0, 0.0])
+    both = Mesh(
+        torch.cat([mask.vertices, mask.vertices + apart]), torch.cat([mask.faces, mask.faces + len(mask.vertices)])
+    )
+    short = Schedule(DEFAULT_SCHEDULE.stages[:1])
+    assert any("more than one place" in note for note in register(mask, both, schedule=short).record.notes)
+    assert not any("more than one" in note for note in register(mask, mask, schedule=short).record.notes)
+
+
 def test_a_planted_deformation_is_recovered(mask: Mesh, truth: Tensor, registered: Registration) -> None:
     """Where there is form or a landmark; the smooth outskirts can slide along themselves unseen, within limits."""
     rigid = (registered.pose.apply(mask.vertices)[0] - truth).norm(dim=1)

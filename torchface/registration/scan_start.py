@@ -17,6 +17,7 @@ from torchface.registration.nonrigid.schedule import Schedule
 from torchface.registration.scan_preparation import Landmarks, PreparedScan, check_landmarks
 
 _RIGID_SAMPLES = 1500
+_OTHER_SHARE, _BESIDE = 0.25, 0.1  # of the scan's points; of the template's size
 _RIGID_REACHES = (20.0, 17.0, 14.0, 12.0, 10.0, 8.0)
 _SIZES, _SURE_FIT = (1.0, 0.85, 1.15), 0.6  # of a template that looks for its place by shape; of its face there
 
@@ -91,7 +92,7 @@ def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: 
         if fit > best:
             best, pose = fit, found
         if best >= _SURE_FIT:
-            return found, []
+            return found, _other_heads(samples, face, scan, found)
     if pose is None:
         raise AlignmentError(
             f"register: the template lies nowhere on the scan by its shape alone: {refused}; give landmarks"
@@ -100,6 +101,33 @@ def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: 
         f"the face was found by its shape alone and fits {best:.2f} of 1 there, where heads fit {_SURE_FIT} and more: "
         "look at the registered mesh (torchface register writes NAME.glb and contact_sheet.png), and give landmarks if "
         "it lies elsewhere"
+    ]
+
+
+def _other_heads(samples: Samples, face: Samples, scan: ScanPoints, found: Similarity) -> list[str]:
+    """A note on a second place where the face fits, if much of the scan lies beside the template there."""
+    places = found.inverse().apply(scan.points)[0]
+    low, high = samples.points.amin(0), samples.points.amax(0)
+    margin = _BESIDE * (high - low)
+    left = ((places < low - margin) | (places > high + margin)).any(1)
+    if float(left.double().mean()) < _OTHER_SHARE:
+        return []
+    rest = ScanPoints(scan.points[left], scan.normals[left], scan.border[left])
+    try:
+        other = find_pose(face, rest, float(found.scale[0]))
+    except AlignmentError:
+        return []
+    if float(other.fit[0]) < _SURE_FIT:
+        return []
+    taken, not_taken = (
+        "("
+        + ", ".join(f"{number:.0f}" for number in pose.apply(face.points.mean(0, keepdim=True))[0, 0].tolist())
+        + ")"
+        for pose in (found, other.pose)
+    )
+    return [
+        f"the face fits in more than one place: the one at {taken} was taken, another is at {not_taken}, millimetres; "
+        "cut the scan to one head, or give landmarks"
     ]
 
 

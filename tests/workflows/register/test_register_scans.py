@@ -84,6 +84,23 @@ def test_each_result_is_what_register_gives_for_that_scan(template: Mesh, scans:
         assert entry.figures["median_mm"] == pytest.approx(alone.record.median_distance, rel=1e-6)
 
 
+def test_a_scan_with_the_templates_triangles_is_taken_as_it_is(
+    template: Mesh, warp: Callable[[torch.Tensor], torch.Tensor], tmp_path: Path
+) -> None:
+    save_mesh(template, tmp_path / "template.ply")
+    template = load_mesh(tmp_path / "template.ply")
+    (tmp_path / "scans").mkdir()
+    head = template.with_vertices(warp(template.vertices))
+    save_mesh(head, tmp_path / "scans" / "head.ply")
+    save_mesh(head.with_vertices(0.1 * head.vertices), tmp_path / "scans" / "small.ply")
+    report = register_scans(template, [tmp_path / "scans"], tmp_path / "out", ScanSettings(schedule=SHORT))
+    made, small = sorted(report.outcomes, key=lambda outcome: outcome.name)
+    assert made.figures["start"] == "its triangles"
+    assert any("taken as it is" in note for note in made.notes)
+    assert "in centimetres" in small.error
+    torch.testing.assert_close(load_mesh(tmp_path / "out" / "head.glb").vertices, head.vertices, atol=1e-3, rtol=0)
+
+
 def test_a_loose_part_that_the_scan_does_not_show_keeps_the_templates_colours(
     template: Mesh, rescanned: Callable[..., Mesh], tmp_path: Path
 ) -> None:

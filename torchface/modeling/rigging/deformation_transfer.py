@@ -6,10 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.errors import AlignmentError, TopologyError, ValueRangeError
-from torchface.geometry.meshes.operators import edges
-from torchface.geometry.meshes.unit_check import check_unit, extent
-from torchface.geometry.mirrored_points import check_mirrored
+from torchface.errors import TopologyError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.part_clearance import clear_parts
@@ -17,15 +14,12 @@ from torchface.modeling.rigging.penetration import inner_parts
 from torchface.modeling.rigging.transfer_system import ShapeTransfer
 from torchface.number_checks import checked_type
 from torchface.progress import Progress
+from torchface.registration.own_topology import check_own_topology
 from torchface.rig import BlendshapeRig
 
 CONTACT_WEIGHT = 30.0
 """Weight of a contact pair beside the squared gradient error of one triangle, a square millimetre."""
 
-_LEAST_EXTENT, _MOST_EXTENT = 0.2, 5.0  # of the source's: characters differ by less, units by more
-# Edges so many times as long as the source's, in one size, and their share: 0.2 % of caricatures twelve standard
-# deviations from the mean head; 97 % where vertices stand in another order, 19 % where a sixth of them does.
-_TORN, _TORN_SHARE = 5.0, 0.05
 _ANOTHER_FACE = 0.01  # millimetres; a target that differs by less is the template, and has the template's own shapes
 
 
@@ -181,31 +175,4 @@ def _check(source: BlendshapeRig, target: Mesh, contact_weight: float) -> None:
             raise ValueRangeError(f"transfer_deformation: found NaN or infinite vertices in the {what}; expected none")
     if not 0 <= contact_weight < float("inf"):
         raise ValueRangeError(f"contact_weight: found {contact_weight}, expected a finite number of at least 0")
-    _check_face(source.neutral, target)
-
-
-def _check_face(source: Mesh, target: Mesh) -> None:
-    """Raises errors where the target has the source's triangles on other points."""
-    used = source.faces.cpu().unique()
-    rest, goal = (mesh.vertices.detach().cpu().double()[used] for mesh in (source, target))
-    size, beside = extent(goal), extent(rest)
-    if size == 0 or beside == 0:
-        return  # the solve says it
-    check_unit("neutral", goal, beside, "the template", _LEAST_EXTENT, _MOST_EXTENT)
-    mirrored = check_mirrored(rest, goal)
-    if mirrored.mirrored:
-        raise AlignmentError(
-            f"neutral: found a mirror image of the template, inside out: {mirrored.figures()} are left; it was "
-            "exported in left-handed axes: export it in right-handed ones, or negate one coordinate of its vertices"
-        )
-    ends = edges(source.faces.cpu())
-    lengths = [(m.vertices.detach().cpu().double()[ends]).diff(dim=1).norm(dim=-1) for m in (source, target)]
-    solid = lengths[0] > 0
-    ratio = (lengths[1][solid] / size) / (lengths[0][solid] / beside)
-    if float((ratio > _TORN).double().mean()) > _TORN_SHARE:
-        raise AlignmentError(
-            f"neutral: found edges of {float(lengths[1].median()):.3g} mm where the template's have "
-            f"{float(lengths[0].median()):.3g} mm (median): its vertices stand in another order than the template's; "
-            "export it with the order kept (Maya, ZBrush and Blender have a setting for it), or lay the template on it "
-            "by torchface register"
-        )
+    check_own_topology(source.neutral, target)

@@ -21,6 +21,7 @@ from torchface.modeling.rigging.part_placement import with_placed_parts
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
 from torchface.registration.model_fit import LinearShape
 from torchface.registration.nonrigid.schedule import Schedule
+from torchface.registration.own_topology import as_it_is
 from torchface.registration.registered_mesh import hidden_parts, in_place_of, with_template_skin
 from torchface.registration.scan_colors import has_colors, without_colors
 from torchface.registration.scan_registration import NO_COLORS, Registration, register
@@ -34,7 +35,7 @@ from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.contact_sheet import HEIGHT, WIDTH
 from torchface.workflows.batch.outcomes import Made
 
-_METHOD = "register/6"
+_METHOD = "register/7"
 """What results are made with; another number where the same scan and settings come to give another result."""
 _MAX_DISTANCE = 1.0  # end of the distance maps' scale, millimetres
 
@@ -101,6 +102,8 @@ class ScanJob:
         mesh, landmarks = load_mesh(scan, self.unit), None
         left_out = not self.colors and has_colors(mesh)
         mesh = without_colors(mesh) if left_out else mesh
+        if mesh.fingerprint() == self.template.fingerprint():
+            return as_it_is(self.template, mesh), 0
         if points is not None:
             landmarks = load_scan_landmarks(points, self.template, scan, self.unit)
         registration = register(

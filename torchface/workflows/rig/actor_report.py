@@ -28,9 +28,9 @@ class ActorReport:
         """For people to read."""
         record = self.neutral.record
         lines = [f"neutral: aligned with the scan by {record.start}; {record.figures()}"]
-        if not record.bent:
-            lines = [f"neutral: {record.start}"]
         lines += [f"  note: {note}" for note in record.notes]
+        if not record.bent:
+            lines = [f"neutral: {note}" for note in record.notes]
         lines.append(f"  figure: {self.figure}")
         lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
         if self.predicted:

@@ -1,6 +1,6 @@
 """From raw scans of an actor and a template rig on disk to the actor's own rig on disk."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import torch
@@ -18,7 +18,6 @@ from torchface.errors import (
 from torchface.files.job_lock import file_lock
 from torchface.files.whole_files import all_or_none, check_writable, make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
-from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_mesh, load_rig, save_rig
 from torchface.io.maya.maya_writing import MAYA_ENDING
 from torchface.io.rig_files import check_rig_ending
@@ -47,7 +46,7 @@ from torchface.modeling.rigging.part_placement import with_mouth_behind_skin
 from torchface.progress import Progress, silent
 from torchface.registration import Registration, hidden_parts, in_place_of, register, with_template_skin
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
-from torchface.registration.nonrigid.registration_record import RegistrationRecord
+from torchface.registration.own_topology import as_it_is
 from torchface.registration.scan_colors import without_colors
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
@@ -149,8 +148,8 @@ def _rig_actor(
     if model is not None and bool(shown.any()):
         raise ValueRangeError("model: found a pose beside a model of heads at rest, expected one of the two")
     registration = job.registered(job.posed(rig, shown), scan, landmarks, options.texture_size, model)
-    as_it_is, parts = not registration.record.bent, inner_parts(rig)
-    if not as_it_is:
+    bent, parts = registration.record.bent, inner_parts(rig)
+    if bent:
         progress("looking at the eyes")
         registration = with_eye_note(
             rig,
@@ -160,7 +159,7 @@ def _rig_actor(
             lambda weights: job.registered(job.posed(rig, weights), scan, landmarks, 0),
         )
     neutral = _at_rest(rig, shown, _upright(registration, rig.neutral))
-    if not as_it_is:  # whose teeth and eyes are where they belong
+    if bent:  # teeth and eyes of the other are where they belong
         neutral = with_mouth_behind_skin(place_parts(rig, neutral, parts))
         neutral = with_template_skin(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
     transferred = transfer_with_report(rig, neutral, progress=progress)
@@ -237,7 +236,7 @@ class _Actor:
     ) -> Registration:
         options, read = self.options, self.read(scan)
         if read.fingerprint() == mesh.fingerprint():
-            return _as_it_is(mesh, read)
+            return as_it_is(mesh, read)
         marks = None if landmarks is None else load_scan_landmarks(landmarks, mesh, scan, options.unit)
         detector = None
         if marks is None and options.detector is not None:
@@ -287,18 +286,6 @@ class _Actor:
         if fine and not maps:
             raise AlignmentError(f"detail: none of {len(fine)} scans could be used; {self.skipped[-1]}")
         return maps
-
-
-def _as_it_is(template: Mesh, head: Mesh) -> Registration:
-    """A head that has the template's triangles, as its registration."""
-    known = torch.ones(len(head.vertices), dtype=torch.bool)
-    pose = similarity_transform(template.vertices.double()[None], head.vertices.double()[None])
-    painted = template if head.texture is None else head
-    mesh = replace(template, vertices=head.vertices, colors=head.colors, texture=head.texture)
-    mesh = replace(mesh, uvs=painted.uvs, uv_faces=painted.uv_faces)
-    start = "taken as it is, for its triangles are the template's (no scan to register)"
-    record = RegistrationRecord(start, 0.0, (), (), 0.0, 1.0, 0.0, 0.0, 1.0, slid=0.0, bent=False)
-    return Registration(mesh, pose, torch.zeros(len(head.vertices)).double(), known, record)
 
 
 def _upright(registration: Registration, template: Mesh) -> Mesh:
