@@ -116,6 +116,22 @@ def test_a_graph_that_disagrees_is_not_written(
     assert not list(tmp_path.iterdir())
 
 
+def test_shapes_that_are_sums_of_others_are_named(
+    bump_rig: BlendshapeRig, bump_sites: Attachment, written: SolverReport, tmp_path: Path
+) -> None:
+    assert (written.mixed, max(gap.distance for gap in written.gaps) < 0.01) == ((), True)
+    deltas = torch.cat([bump_rig.deltas, bump_rig.deltas[:2].sum(0, keepdim=True)])
+    names = (*bump_rig.names, "both")
+    report = export_solver(BlendshapeRig(bump_rig.neutral, deltas, names), bump_sites, tmp_path / "solver.onnx")
+    assert report.mixed == (*bump_rig.names[:2], "both")
+    assert "weights at most" in str(report)
+    far = replace(report, gaps=(replace(report.gaps[0], worst=2e-4, distance=0.47),))
+    assert far.verdict().startswith("result: poor")
+    assert (
+        f"0.47 from the exact solve's, as the markers do not distinguish {names[0]}, {names[1]}, both" in far.verdict()
+    )
+
+
 @pytest.mark.bench  # torch.export takes twenty seconds; test_solver_graph.py tries the module that is exported
 def test_the_hybrid_file_computes_it_and_says_what_it_takes(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
     path = tmp_path / "hybrid.onnx"

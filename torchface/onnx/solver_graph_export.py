@@ -16,6 +16,7 @@ from torch import Tensor
 from torchface.attachment import Attachment
 from torchface.capture.markers.hybrid_solver import GAMMA, HybridSolver
 from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
+from torchface.capture.markers.observability import observability
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import write_file
 from torchface.landmarks.images.graph_session import graph_session
@@ -36,6 +37,8 @@ _USUAL = 1e-3  # of the energy: 0.0003 mm of a marker error of 0.5 mm
 # Two runs that round differently may lie a few times as far from each other as one does from the exact sum; a graph
 # that computes something else lies much farther.
 _ROUNDINGS = 10.0
+_SHOWN = 8
+_FAR = 0.05  # of a weight from the exact solve's: seen in an animation
 _TEST_FRAMES, _CORRECTIVE_FRAMES = 512, 48
 _FRAMES_A_POSE = 10
 _MISSING = (0.0, 0.1, 0.3)
@@ -48,6 +51,7 @@ class SolverGap:
     missing: float  # share of markers missing
     worst: float
     median: float
+    distance: float  # largest of a weight from the exact solve's
     parity: float  # largest difference of a weight between ONNX Runtime and the same graph in PyTorch
     # The same between PyTorch in single and in double precision: what shapes that the markers hardly see owe to
     # rounding alone.
@@ -64,6 +68,7 @@ class SolverReport(WrittenGraph):
         gaps: at 0, 10 and 30 % missing markers.
         milliseconds: median of one frame by one thread of ONNX Runtime here, every marker seen.
         milliseconds_with_gaps: the same with missing markers.
+        mixed: shapes whose motion of the markers others imitate.
     """
 
     rho: float | None
@@ -72,6 +77,7 @@ class SolverReport(WrittenGraph):
     gaps: tuple[SolverGap, ...]
     milliseconds: float
     milliseconds_with_gaps: float
+    mixed: tuple[str, ...] = ()  # shapes that the markers cannot distinguish from others
 
     def verdict(self) -> str:
         """Whether the graph is to be used, in a line; what ONNX Runtime computes otherwise than PyTorch is an error."""
@@ -80,7 +86,15 @@ class SolverReport(WrittenGraph):
             f"the graph's error (squared distances and penalties) is at most {max(100 * worst, 0.001):.2g} % above the "
             f"exact solve's, the least possible (up to {100 * _USUAL:.2g} % is usual)"
         )
-        if worst > _USUAL:
+        far = max((gap.distance for gap in self.gaps), default=0.0)
+        if far > _FAR:
+            found += f"; weights lie up to {far:.2f} from the exact solve's"
+        if far > _FAR and self.mixed:
+            shown = ", ".join(self.mixed[:_SHOWN]) + (
+                f" and {len(self.mixed) - _SHOWN} more" * (len(self.mixed) > _SHOWN)
+            )
+            found += f", as the markers do not distinguish {shown} from one another: leave out what others add up to"
+        if worst > _USUAL or far > _FAR:
             return f"result: poor, {found}; more steps bring it nearer (GraphSteps in Python), or the other --method"
         return f"result: good, {found}, and ONNX Runtime gives the weights that PyTorch gives"
 
@@ -97,7 +111,8 @@ class SolverReport(WrittenGraph):
                 (
                     f"{gap.missing:.0%} of the markers missing",
                     f"error above the exact solve's: {100 * gap.worst:.1e} % in the worst frame, "
-                    f"{100 * gap.median:.1e} % in the median; ONNX Runtime's weights lie {gap.parity:.1e} from "
+                    f"{100 * gap.median:.1e} % in the median; weights at most {gap.distance:.2g} apart; "
+                    f"ONNX Runtime's weights lie {gap.parity:.1e} from "
                     f"PyTorch's (rounding alone: {gap.rounding:.1e})",
                 )
             )
@@ -270,6 +285,7 @@ def _export(
         tuple(gaps),
         _milliseconds(session, frames, more),
         _milliseconds(session, hide_markers(frames, 0.3), more),
+        observability(graph.solver).ambiguous,
     )
 
 
@@ -339,7 +355,8 @@ def _gap(
     precise = [double(markers.double(), start.double(), *precise_more) for start in starts]
     rounding = max(float((own - weights).abs().max()) for own, weights in zip(here, precise, strict=True))
     gaps = torch.stack([(energy.value(weights.double()) - least) / least for weights in solved])
-    return SolverGap(missing, float(gaps.max()), float(gaps.median()), parity, rounding)
+    distance = max(float((weights.double() - optimum).abs().max()) for weights in solved)
+    return SolverGap(missing, float(gaps.max()), float(gaps.median()), distance, parity, rounding)
 
 
 def _milliseconds(session: onnxruntime.InferenceSession, frames: Tensor, more: tuple[Tensor, ...]) -> float:
