@@ -11,7 +11,8 @@ from torch import Tensor
 from torchface.errors import ShapeError
 from torchface.files.whole_files import read_file, write_file
 from torchface.geometry.meshes.normal_maps import encode_normals
-from torchface.io.images.image_samples import decode_samples
+from torchface.io.images.color_profiles import in_srgb
+from torchface.io.images.image_samples import Samples, decode_samples
 
 IMAGE_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".webp", ".tif", ".tiff", ".ppm", ".pgm")
 """What photographs are called; :func:`load_image` goes by their content."""
@@ -21,7 +22,7 @@ def load_image(path: str | Path) -> Tensor:
     """An image file as (3,H,W) float32 in [0,1], upright: turned as its EXIF orientation says, as viewers show it.
 
     Grey or RGB of 1 to 16 bits, palettes and CMYK; floating-point TIFF where its values lie in [0,1]. Transparency is
-    left out.
+    left out. Colours in another space than sRGB, by a profile in the file or a PNG's gAMA, are converted to it.
 
     Raises:
         FileFormatError: the file is missing, no image, of a kind that is not read, or unpacks to far more pixels than
@@ -32,7 +33,7 @@ def load_image(path: str | Path) -> Tensor:
         >>> load_image("photo.png").shape
         torch.Size([3, 4, 6])
     """
-    return decode_image(read_file(path), str(path))
+    return _samples(read_file(path), str(path)).colors()
 
 
 def save_image(image: Tensor, path: str | Path) -> None:
@@ -60,7 +61,8 @@ def save_image16(image: Tensor, path: str | Path) -> None:
 
 
 def decode_image(data: bytes, source: str) -> Tensor:
-    """The image (3,H,W) in ``data``; ``source`` names it in errors."""
+    """The image (3,H,W) in ``data``, colour profiles left out, as glTF 2.0 (3.8.2) and USD say; ``source`` names it in
+    errors."""
     return decode_samples(data, source).colors()
 
 
@@ -111,4 +113,10 @@ def save_normal_map(normals: Tensor, path: str | Path) -> None:
 
 def load_paint(path: str | Path) -> Tensor:
     """An image file as red, green, blue and alpha, (4,H,W) float32 in [0,1]; one without transparency is opaque."""
-    return decode_samples(read_file(path), str(path), planes=4).paint()
+    return _samples(read_file(path), str(path), planes=4).paint()
+
+
+def _samples(data: bytes, source: str, planes: int = 3) -> Samples:
+    """Of a file by itself: what its profile says counts."""
+    stored = decode_samples(data, source, planes)
+    return Samples(in_srgb(stored.array, data, source))

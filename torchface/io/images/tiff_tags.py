@@ -7,7 +7,7 @@ from torchface.errors import FileFormatError
 
 WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC = 256, 257, 258, 259, 262
 ORIENTATION, SAMPLES, TILE_WIDTH, TILE_HEIGHT, SAMPLE_FORMAT = 274, 277, 322, 323, 339
-SUBFILE, DNG_VERSION = 254, 50706
+SUBFILE, DNG_VERSION, ICC_PROFILE = 254, 50706, 34675
 _WANTED = {
     *(WIDTH, HEIGHT, BITS, COMPRESSION, PHOTOMETRIC, ORIENTATION, SAMPLES, TILE_WIDTH, TILE_HEIGHT, SAMPLE_FORMAT),
     *(SUBFILE, DNG_VERSION),
@@ -45,6 +45,12 @@ def first_directory(data: bytes, source: str) -> dict[int, tuple[int, ...]]:
     except (struct.error, OverflowError) as error:
         raise FileFormatError(f"{source}: found tags that are cut off ({error})") from error
     return values
+
+
+def tag_bytes(data: bytes, source: str, tag: int) -> bytes:
+    """What a tag of a TIFF's first directory points at; empty without it."""
+    found = next((entry for entry in _entries(data, source)[1] if entry.tag == tag), None)
+    return b"" if found is None else data[found.place : found.place + found.number * _SIZES.get(found.kind, 0)]
 
 
 def without_metadata(data: bytes, source: str) -> bytes:
