@@ -76,7 +76,7 @@ def weight_curves(solved: Tensor, true: Tensor | None, names: Sequence[str], fps
         >>> bool(picture.min() < 0.5 and picture.max() == 1)  # drawn on white
         True
     """
-    order = (solved if true is None else true).std(0).argsort(descending=True)[:max_shapes].tolist()
+    order = (solved if true is None else true).std(0, correction=0).argsort(descending=True)[:max_shapes].tolist()
     curves = [("sum of weights", solved.sum(1), None if true is None else true.sum(1))]
     curves += [(names[i], solved[:, i], None if true is None else true[:, i]) for i in order]
     figure = new_figure(10, _ROW * len(curves) + 0.55, layout="constrained")

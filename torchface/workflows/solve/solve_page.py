@@ -72,7 +72,7 @@ def _player(folder: Path, solution: Solution) -> str:
     rows = solution.take.even_rows()
     rig, weights = solution.rig, solution.weights.float()[rows]
     errors = solution.offsets.norm(dim=-1)[rows]
-    active = weights.std(0).argsort(descending=True)[:_ACTIVE].tolist()
+    active = weights.std(0, correction=0).argsort(descending=True)[:_ACTIVE].tolist()
     markers = Markers(solution.markers.float()[rows], errors, _scale(errors))
     panels = [Panel("solved", 0, markers=True), Panel("from the side", 0, markers=True, yaw=_SIDE)]
     curves = tuple(rig.names[i] for i in active)
