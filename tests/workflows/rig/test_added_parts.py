@@ -18,7 +18,7 @@ from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.workflows.rig.character_face import character_search
 from torchface.workflows.rig.character_rig import CharacterReport, rig_character
-from torchface.workflows.rig.face_openings import Loop
+from torchface.workflows.rig.face_openings import Loop, OpenedFace
 
 AXIS, STEP = -15.0, 2.5  # millimetres: the axis round which the head is sampled, and how densely
 
@@ -66,6 +66,28 @@ def known_face(patch: pytest.MonkeyPatch) -> None:
 def motion(character: Character, name: str) -> torch.Tensor:
     (block,) = character.blocks
     return 1000 * character.targets(block)[block.names.index(name)].double()
+
+
+@pytest.mark.parametrize("inward", [False, True])
+def test_the_upper_edge_of_a_hole_is_that_below_the_skin_above(inward: bool) -> None:
+    """Of lips that cross at rest the upper one lies lower."""
+    row, column = torch.arange(-6, 7), torch.arange(-8, 9)
+    y, x = torch.meshgrid(5.0 * row, 5.0 * column, indexing="ij")
+    rest = torch.stack([x, y, 0 * x], -1).reshape(-1, 3).double()
+    ids = torch.arange(len(rest)).view(13, 17)
+    quads = torch.stack([ids[:-1, :-1], ids[:-1, 1:], ids[1:, 1:], ids[1:, :-1]], -1).reshape(-1, 4)
+    middles = rest[quads].mean(1)
+    quads = quads[(middles[:, 0].abs() > 20) | (middles[:, 1].abs() > 5)]
+    faces = quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
+    lips = [ids[one, 5:12] for one in (7, 5)]  # 5 mm above and below the line between them
+    for lip, height in zip(lips, (-1.0, 1.0), strict=True):
+        rest[lip, 1] = height
+    way = torch.linspace(0, 2 * torch.pi, 25)[:-1].double()
+    edge = torch.stack([20 * way.cos(), 3 * way.sin(), 0 * way], -1)
+    loop = OpenedFace(rest, faces.flip(1) if inward else faces, torch.ones(len(rest), dtype=torch.bool)).hole(edge)
+    upper = loop.vertices[(loop.share > 0) & (loop.share < 0.5)].tolist()
+    assert set(lips[0].tolist()) <= set(upper)
+    assert not set(lips[1].tolist()) & set(upper)
 
 
 def test_the_upper_edge_of_lips_that_have_crossed_is_that_of_its_vertex() -> None:

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.meshes.cutting import CutMesh
-from torchface.geometry.meshes.operators import border_edges
+from torchface.geometry.meshes.operators import border_edges, triangle_cross
 from torchface.modeling.rigging.joined_vertices import joined_vertices
 from torchface.rendering.raycast import RayCaster
 
@@ -92,7 +92,16 @@ class OpenedFace:
             near = float((places.mean(0) - middle)[:2].norm()) < _HOLE_OFF and len(loop) > 5
             if near and best < wide < _HOLE[1] * width:
                 best, found = wide, file_row[torch.tensor(loop)]
-        return None if found is None else Loop.of(found, self._rest)
+        if found is None:
+            return None
+        # Seen from outside skin lies to the left of its border: from the right end on that is the upper edge, also of
+        # lips that cross at rest. A file's triangles may face inward.
+        at = self._joined.vertices
+        around = (at[faces].mean(1) - middle).norm(dim=-1) < width
+        outward = float(triangle_cross(at, faces)[around, 2].sum()) > 0
+        found = found.roll(-int(self._rest[found, 0].argmax()))
+        right = int(self._rest[found, 0].argmin())
+        return Loop.of(found, self._rest, int(found[(right + len(found)) // 2 if outward else right // 2]))
 
     def lined(self, edge: Tensor) -> bool:
         """Whether something lies behind the lips, whose edge on the template is (n,3)."""
