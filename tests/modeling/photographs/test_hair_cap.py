@@ -1,8 +1,10 @@
-"""The hair's colour of washed-out pictures."""
+"""Hair as a cap: its colour in washed-out pictures, where it ends, and leaves that are none."""
 
 import torch
 
-from torchface.modeling.photographs.hair_cap import without_veil
+from torchface.modeling.photographs.hair_cap import HairCap, _leaves, without_veil
+from torchface.modeling.photographs.skin_mask import FacePlaces
+from torchface.synthetic import neutral_head
 
 
 def test_hair_is_as_dark_beside_skin_as_without_the_veil() -> None:
@@ -21,3 +23,25 @@ def test_hair_is_as_dark_beside_skin_as_without_the_veil() -> None:
     assert torch.equal(without_veil(veiled_skin + 0.1, veiled_skin, [veiled], [head]), veiled_skin + 0.1)  # fair hair
     outside = head + 500.0  # a head beside the picture has nothing that is dark
     assert bool(without_veil(veiled_hair, veiled_skin, [veiled], [outside]).isfinite().all())
+
+
+def test_long_hair_goes_on_behind_the_ears_and_leaves_them_bare() -> None:
+    places = FacePlaces.of(neutral_head(texture=False))
+    at = torch.tensor([[0.0, -1.1, places.ears - 0.9], [0.9, -0.2, places.ears - 0.35], [0.0, 1.0, places.ears - 0.9]])
+    line = torch.full((17,), 0.6, dtype=torch.float64)
+    short, long = (HairCap(torch.zeros(3), line, places, one).share(at.double()) for one in (False, True))
+    assert float(short[0]) < 0.1  # the neck
+    assert float(long[0]) > 0.9
+    assert float(torch.stack([short, long])[:, 1].max()) < 0.1  # an ear
+    assert float(torch.stack([short, long])[:, 2].min()) > 0.9
+
+
+def test_patches_beside_green_are_leaves_and_whole_hair_before_a_green_wall_is_hair() -> None:
+    green = torch.tensor([0.3, 0.4, 0.3])[:, None, None].expand(3, 40, 40)
+    skin = torch.zeros(40, 40)
+    skin[20:] = 1.0
+    patches = (torch.rand(40, 40, generator=torch.Generator().manual_seed(1)) < 0.5) & (skin == 0)
+    whole = (torch.arange(40)[:, None] > 8).expand(40, 40) & (skin == 0)
+    assert _leaves(green, patches, skin)
+    assert not _leaves(green, whole, skin)
+    assert not _leaves(green.mean(0, keepdim=True).expand(3, 40, 40), patches, skin)

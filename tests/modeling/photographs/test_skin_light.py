@@ -107,6 +107,22 @@ def test_a_photographs_brows_are_the_only_ones(head: Mesh, camera: Camera) -> No
     assert float((found[places.brow & ~fringe] - SKIN).norm(dim=1).mean()) < 0.1
 
 
+def test_skin_under_hair_is_skin_in_spite_of_its_shadow_and_of_a_templates_hair(head: Mesh, camera: Camera) -> None:
+    places = FacePlaces.of(head)
+    assert head.colors is not None
+    up = places.place[:, 1]
+    fringe, band = up > 0.45, (up > places.brows + 0.12) & (up < 0.45) & (places.place[:, 0].abs() < 0.4)
+    template = replace(head, colors=torch.where((up > 0.6)[:, None], HAIR, head.colors))
+    shaded = torch.where(band[:, None], 0.6 * SKIN, head.colors)
+    picture = render(replace(head, colors=torch.where(fringe[:, None], HAIR, shaded)), camera, lighting=EVEN, samples=1)
+    parts = planted_parts(picture, {"hair": HAIR, "background": torch.zeros(3)}, 0.05)
+    settings = FitSettings(texture_size=128, parts=[parts], paint_hair=False)
+    found = photographed_skin([template], None, [picture], [camera], settings).colors
+    assert found is not None
+    for where in (band, fringe & (places.behind < 0.3)):
+        assert float((found[where] - SKIN).norm(dim=1).quantile(0.95)) < 0.06
+
+
 def test_a_hard_shadow_on_the_face_is_taken_away_and_a_mole_is_not(head: Mesh, camera: Camera) -> None:
     places = FacePlaces.of(head)
     shade = torch.where(places.place[:, :1] > 0.1, torch.tensor([0.75, 0.6, 0.4]), torch.tensor([1.0, 1.0, 1.0]))
@@ -164,6 +180,7 @@ def test_a_dark_complexion_stays_dark_before_a_dark_wall() -> None:
 
     assert gain(0.25, 0.6) == pytest.approx(1.0, abs=0.05)  # its eyes are as bright as in good light
     assert gain(0.35, 0.35) > 2.0  # fair in a dim picture: its eyes are dim too
+    assert gain(0.25, 0.85) > 1.1  # brighter than any white beside that skin: light in glasses
 
 
 def test_blush_on_both_cheeks_stays_and_light_on_one_goes(head: Mesh) -> None:

@@ -10,10 +10,11 @@ from torchface.geometry.cameras.pinhole import look_at
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.landmarks.images.networks.part_network import PARTS
 from torchface.modeling import ImageFit
+from torchface.modeling.photographs.hair_cap import hangs_down
 from torchface.synthetic import neutral_head, performer
 from torchface.synthetic.head.signed_distance import EYE_CENTRE
 from torchface.synthetic.head.skin_texture import eye_color
-from torchface.workflows.fit.fitted_character import dressed_rig, hangs_down, iris_size
+from torchface.workflows.fit.fitted_character import dressed_rig, iris_size
 
 SIZE, HAIR, SKIN = 128, PARTS.index("hair"), PARTS.index("skin")
 

@@ -5,15 +5,32 @@ from torch import Tensor
 
 from torchface.geometry.meshes.operators import edges
 
+_EDGE = 4.6  # millimetres: of the performer's mesh, in whose rings of vertices reaches over heads are counted
+_FINEST = 4.0
+
 
 class VertexGraph:
-    """Which vertices are neighbours: values are blurred and filled over the mesh rather than over its layout."""
+    """Which vertices are neighbours: values are blurred and filled over the mesh rather than over its layout.
 
-    def __init__(self, faces: Tensor, count: int) -> None:
+    Args:
+        faces: (F,3).
+        count: of vertices.
+        vertices: of a head, (V,3) millimetres: a round over a finer mesh is as many as reach as far.
+    """
+
+    def __init__(self, faces: Tensor, count: int, vertices: Tensor | None = None) -> None:
         self.first, self.second = edges(faces).T
+        self.finer = 1.0
+        if vertices is not None:
+            edge = float((vertices[self.first] - vertices[self.second]).norm(dim=1).median())
+            self.finer = min(max((_EDGE / max(edge, 1e-6)) ** 2, 1 / _FINEST), _FINEST)
         degree = torch.zeros(count, dtype=torch.float64)
         one = torch.ones(len(self.first), dtype=torch.float64)
         self.degree = degree.index_add(0, self.first, one).index_add(0, self.second, one).clamp(min=1)
+
+    def rounds(self, iterations: int) -> int:
+        """How many rounds reach as far as these on the performer's mesh."""
+        return max(1, round(iterations * self.finer))
 
     def sum(self, values: Tensor, itself: bool = False) -> Tensor:
         """Of the values (V,...) of each vertex's neighbours, and of the vertex itself if asked for, (V,...)."""
@@ -23,7 +40,7 @@ class VertexGraph:
     def smoothed(self, values: Tensor, weights: Tensor, iterations: int) -> Tensor:
         """Weighted means (V,C) over ever wider surroundings; where nothing has a weight, 0."""
         top, bottom = values * weights[:, None], weights[:, None]
-        for _ in range(iterations):
+        for _ in range(self.rounds(iterations)):
             both = torch.cat([top, bottom], dim=1)
             both = 0.5 * (both + self.sum(both) / self.degree[:, None])
             top, bottom = both[:, :-1], both[:, -1:]

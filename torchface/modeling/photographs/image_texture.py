@@ -13,7 +13,7 @@ from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.photographs.eye_color import IRIS_WIDTH, iris_color
 from torchface.modeling.photographs.fit_settings import FitSettings
-from torchface.modeling.photographs.hair_cap import HairCap, hair_beyond, hair_cap, without_veil
+from torchface.modeling.photographs.hair_cap import HairCap, hair_cap, without_veil
 from torchface.modeling.photographs.landmark_view import LANDMARKS
 from torchface.modeling.photographs.skin_light import (
     exposed,
@@ -34,13 +34,16 @@ from torchface.rendering.environment_light import EnvironmentLight
 GREY = 0.015
 """Mean difference of the channels below which a photograph has no colours."""
 
+_STRANDS = 0.5  # how near hair is from which what is dark beside a brow may be its ends
 _BARE = 0.7  # share of skin from which a vertex counts for the light
-# Cosine, of full white, of the distance of the eyes' outer corners, share of skin.
-_SQUARE, _UNLIKE, _AROUND, _WITHIN = 0.2, 0.16, 0.14, 0.85
-_BROWS, _REPAINTED = 0.5, 12  # share of a brow that photographs show, rings of vertices
+_SQUARE, _UNLIKE, _AROUND, _WITHIN = 0.2, 0.16, 30, 0.85  # cosine, of full white, rounds, share of skin
+_BROWS = 0.5  # share of a brow that photographs show
+# In distances of the eyes' outer corners: behind the ears' landmarks, and before them so far over the eyes, hair may
+# grow. Logarithms of colours by which shades of skin differ.
+_SCALP, _AS_DARK = (0.35, -0.3, -0.5), 0.12
 _PUPIL = 0.38  # of the iris
 _LID_SHADOW = 0.5  # of the eye's opening
-_TONE = 40  # rounds over the mesh: the skin around
+_TONE, _SEAM = 40, 16  # rounds over the mesh: the skin around, and the band in which what is completed begins
 _EVEN = 0.04, 0.10  # of a skin's brightness: what is added to it against shadows in even light at most, in shadows
 _DARK = 0.02  # of full white
 # Logarithms by which a place of skin differs from the skin around it, in brightness and hue: strands of hair, and folds
@@ -110,7 +113,7 @@ def photographed_skin(
     patches: list[Tensor] | None = None
     cap: HairCap | None = None
     if _has_landmarks(mesh):
-        graph = VertexGraph(mesh.faces.cpu(), len(mesh.vertices))
+        graph = VertexGraph(mesh.faces.cpu(), len(mesh.vertices), mesh.vertices.detach().cpu())
         seen: Sequence[FaceParts | None] = parts or [None] * count
         views = [
             _lit_evenly(image, camera, surface, FacePlaces.of(one), known, graph, others)
@@ -125,13 +128,12 @@ def photographed_skin(
             images, patches = [view.image for view in views], [view.patch for view in views]
             places = [view.places for view in views]
             confidence = torch.stack([view.parts.own * _like_skin(view, graph) for view in views])
-            if base is not None and float(confidence[:, places[0].brow].amax(0).mean()) > _BROWS:
-                base = _without_brows(base, places[0], graph)
+            if base is not None:
+                base = _bare(base, places[0], graph, float(confidence[:, places[0].brow].amax(0).mean()) > _BROWS)
             hair = torch.where(others, 0.0, torch.stack([view.parts.hair for view in views]))
-            cap = hair_cap([view.shown for view in views], places, hair)
             pixels = [view.camera.project(view.surface.vertices) for view in views]
-            if cap is None:
-                cap = hair_beyond(images, parts, [one[mesh.landmarks.cpu()] for one in pixels], places[0])
+            marks = [one[mesh.landmarks.cpu()] for one in pixels]
+            cap = hair_cap(images, parts, marks, [view.shown for view in views], places, hair)
             bare = torch.cat([view.shown.colors[view.parts.bare > _BARE] for view in views])
             if cap is not None and len(bare):
                 cap = replace(cap, color=without_veil(cap.color, bare.median(0).values, images, pixels))
@@ -200,7 +202,9 @@ def _without_patches(
     hue = light_hue(shown.colors, skin, base)
     image = (view.image / hue[:, None, None]).clamp(0, 1).to(view.image)
     shown = replace(shown, colors=(shown.colors / hue).clamp(0, 1).to(shown.colors))
-    return replace(view, image=image, shown=shown, patch=patch_offset(shown.colors, skin, base, graph, mirror))
+    return replace(
+        view, image=image, shown=shown, patch=patch_offset(shown.colors, skin, base, graph, mirror, view.parts.doubt)
+    )
 
 
 def _spectacles(views: Sequence[_View], glasses: Sequence[Tensor]) -> Tensor:
@@ -234,11 +238,23 @@ def _without_sharp_shadows(
     colors = texture.colors.double()
     tone = graph.smoothed(colors, bare * ~places.features, _TONE)
     added = torch.stack([view.patch for view in views]).abs().mean(-1).amax(0) / tone.mean(1).clamp(min=_DARK)
+    doubt = torch.stack([view.parts.doubt for view in views]).amax(0)
     shaded = ((graph.smoothed(added[:, None], bare, _TONE)[:, 0] - _EVEN[0]) / (_EVEN[1] - _EVEN[0])).clamp(0, 1)
     image = texture.image.flatten(1)[:, texture.texels.texels].T.double()
+    flat = torch.maximum(bare * places.rim * torch.maximum(shaded, doubt), places.lids * ~others)
+    flat = torch.maximum(flat, doubt * ~(places.features | others))  # strands
+    # What no photograph shows has another tone: seen skin comes near it toward its edge, over a broad band.
+    apart, seen = places.features | others, texture.seen.double()
+    inside = torch.where(apart, 1.0, seen)
+    for _ in range(graph.rounds(_SEAM)):
+        inside = torch.minimum(inside, 0.5 * (inside + graph.sum(inside[:, None])[:, 0] / graph.degree))
+    step = graph.smoothed(colors, (1 - seen) * ~apart, _SEAM) - graph.smoothed(colors, seen * bare * ~apart, _SEAM)
+    step = step * (seen * (1 - inside) * ~others)[:, None]
+    image, colors = image + texture.texels.interpolate(step, faces), colors + step
+    tone = tone + step
     for weight, most in (
         (bare * places.rim, _FOLDS),
-        (torch.maximum(bare * places.rim * shaded, places.lids * ~others), _PORES),
+        (flat, _PORES),
         (frames * ~others, _FRAMED_SKIN),
     ):
         at = texture.texels.interpolate(torch.cat([tone, weight.double()[:, None]], dim=1), faces)
@@ -247,10 +263,19 @@ def _without_sharp_shadows(
     return replace(texture, image=texture.texels.image(image.clamp(0, 1)), colors=colors.float())
 
 
-def _without_brows(colors: Tensor, places: FacePlaces, graph: VertexGraph) -> Tensor:
-    """Vertex colours (V,3) with skin for brows: beside those of photographs a template's would be a second pair."""
-    beside = graph.smoothed(colors.double(), (~places.brow).double(), _REPAINTED)
-    return torch.where(places.brow[:, None], beside, colors.double()).to(colors)
+def _bare(colors: Tensor, places: FacePlaces, graph: VertexGraph, brows: bool) -> Tensor:
+    """Vertex colours (V,3) with skin for hair, and for brows where photographs show those: others' are not theirs."""
+    colors = colors.double()
+    skin = colors[places.cheeks].median(0).values
+    darker = (skin.clamp(min=_DARK).log() - colors.clamp(min=_DARK).log()).clamp(min=0).norm(dim=1)
+    up, behind = places.place[:, 1], places.behind
+    scalp = (up > places.brows) | (behind > _SCALP[0]) | ((behind > _SCALP[1]) & (up > _SCALP[2]))
+    own = torch.where(scalp & ~places.features, torch.exp(-0.5 * (darker / _AS_DARK).square()), 1.0)
+    own = own * ~(places.brow & brows)
+    forehead = (up > places.brows) & (places.out < 1) & (own > _BARE) & ~places.features
+    skin = colors[forehead if bool(forehead.any()) else places.cheeks].median(0).values
+    beside = graph.smoothed(torch.lerp(skin, colors, own[:, None]), own * ~places.features + 1e-3, _TONE)
+    return torch.lerp(beside, colors, own[:, None]).float()
 
 
 def _like_skin(view: _View, graph: VertexGraph) -> Tensor:
@@ -261,10 +286,9 @@ def _like_skin(view: _View, graph: VertexGraph) -> Tensor:
         return torch.ones_like(bare)
     skin = shown.colors[bare > _BARE].double().median(0).values
     unlike = (skin - shown.colors.double()).clamp(min=0).norm(dim=1) / _UNLIKE  # highlights are skin
-    edge = (places.place[graph.first] - places.place[graph.second]).norm(dim=1).median()
-    rings = round(4 * float(_AROUND / edge) ** 2)
-    around = graph.smoothed((parts.own * (shown.cosine > _SQUARE))[:, None], torch.ones_like(bare), rings)[:, 0]
-    return (places.features | (around > _WITHIN) | (unlike < 1) | (parts.own - parts.bare > 0.3)).double()
+    around = graph.smoothed((parts.own * (shown.cosine > _SQUARE))[:, None], torch.ones_like(bare), _AROUND)[:, 0]
+    surely = places.features & ~(places.brow & (parts.doubt > _STRANDS))
+    return (surely | (around > _WITHIN) | (unlike < 1) | (parts.own - parts.bare > 0.3)).double()
 
 
 def _capped(texture: PhotoTexture, cap: HairCap, mesh: Mesh, parts: Tensor) -> PhotoTexture:

@@ -23,6 +23,7 @@ _FAINT, _BRIGHT, _TINT = 0.4, 2.2, 1.12  # beside the mean: what the estimate ma
 _PATCH = 4  # rounds over the mesh: what is smaller is the skin's own
 # Logarithms of sRGB by which one person's skin differs over the face, and half of that between its sides.
 _OWN_TONE, _OWN_HUE, _TWIN = 0.2, 0.12, 0.04
+_BESIDE_HAIR = 0.25  # of these where skin may lie in its shadow
 _BOTH = 0.2  # share of skin from which both sides are compared
 _PEOPLE_HUE = (0.15, 0.06, 0.15)  # of the channels, by which skins of people differ from the colour model
 _AROUND = 40  # rounds
@@ -33,12 +34,13 @@ _SURE, _DARKEST = 0.5, 0.02
 # shade there: in 9 good photographs 0.31 to 0.66, in 4 dim ones 0.09 to 0.20.
 _WHITE, _FAIR, _EYE_WHITE = 0.91, 0.36, 0.3
 _BRIGHTEST, _EYE = 0.99, 0.95  # quantiles
-_BRIGHTER = 2.5  # at most
+_BRIGHTER = 5.0  # at most: in what is darker, colours are hardly told from noise
+_GLINT = 8.0  # times as bright as skin: no white of an eye is, but light in glasses
 _EYE_PIXELS = 10  # of the crop
 
 
 def exposure_gain(image: Tensor, parts: FaceParts) -> float:
-    """What a photograph's light is multiplied by, at most 2.5, to be well exposed; what is too dark shows nobody's
+    """What a photograph's light is multiplied by, at most 5, to be well exposed; what is too dark shows nobody's
     complexion."""
     return min(needed_gain(image, parts), _BRIGHTER)
 
@@ -56,7 +58,8 @@ def needed_gain(image: Tensor, parts: FaceParts) -> float:
     brightest = [float(one.kthvalue(1 + int(_BRIGHTEST * (len(one) - 1))).values) for one in (whole, near)]
     gain = math.prod(max(1.0, _WHITE / max(one, 0.01)) for one in brightest) ** 0.5
     limits = [_FAIR / max(float(skin.median()), 1e-3)] if len(skin) else []
-    limits += [_EYE_WHITE / max(float(eyes.quantile(_EYE)), 1e-3)] if len(eyes) >= _EYE_PIXELS else []
+    white = max(float(eyes.quantile(_EYE)), 1e-3) if len(eyes) >= _EYE_PIXELS else torch.inf
+    limits += [_EYE_WHITE / white] if len(skin) and white < _GLINT * float(skin.median()) else []
     return max(1.0, min([gain, *limits]))
 
 
@@ -132,7 +135,12 @@ def light_hue(colors: Tensor, skin: Tensor, tone: Tensor | None) -> Tensor:
 
 
 def patch_offset(
-    colors: Tensor, skin: Tensor, tone: Tensor | None, graph: VertexGraph, mirror: Tensor | None = None
+    colors: Tensor,
+    skin: Tensor,
+    tone: Tensor | None,
+    graph: VertexGraph,
+    mirror: Tensor | None = None,
+    doubt: Tensor | None = None,
 ) -> Tensor:
     """What takes away shadows that the face throws on itself and highlights that ``skin_light`` leaves, (V,3).
 
@@ -145,6 +153,7 @@ def patch_offset(
         skin: how surely each vertex is seen to be skin, (V,) in [0,1].
         tone: of a skin like it, (V,3); one for all vertices if absent.
         mirror: of each vertex its twin on the other side, (V,).
+        doubt: how much each may lie in the shadow of hair, (V,) in [0,1]; nowhere if absent.
 
     Returns:
         To be added to the colours, so that grain in dark places is not multiplied.
@@ -154,14 +163,18 @@ def patch_offset(
     broad = graph.smoothed(colors.double(), skin, _PATCH)
     like = torch.zeros_like(broad) if tone is None else _log(graph.smoothed(tone.double(), skin, _PATCH))
     apart = _log(broad) - like
-    own = apart[skin > _SURE].median(0).values
+    sure = skin if doubt is None else skin * (1 - doubt)
+    own = apart[(sure if int((sure > _SURE).sum()) >= _LEAST else skin) > _SURE].median(0).values
     apart = apart - own
     seen = graph.smoothed(skin[:, None], torch.ones_like(skin), _PATCH).clamp(max=1)
     twin = torch.zeros_like(apart)
     if mirror is not None:
         both = torch.minimum(seen, seen[mirror])
         twin = torch.where(both > _BOTH, 0.5 * (apart - apart[mirror]), 0.0)
-    wanted = like + own + _limited(apart - twin, _OWN_TONE, _OWN_HUE) + _limited(twin, _TWIN, _TWIN)
+    narrow = torch.ones_like(broad[:, :1]) if doubt is None else 1 - (1 - _BESIDE_HAIR) * doubt[:, None]
+    wanted = (
+        like + own + narrow * (_limited((apart - twin) / narrow, _OWN_TONE, _OWN_HUE) + _limited(twin, _TWIN, _TWIN))
+    )
     offset = wanted.exp() - broad
     return torch.lerp(graph.smoothed(offset, seen[:, 0], _AROUND), offset, seen)
 

@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
-from torch.nn.functional import max_pool2d
+from torch.nn.functional import avg_pool2d, max_pool2d
 
 from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.landmarks.images.networks.part_finder import FaceParts
@@ -19,10 +19,12 @@ _FOREHEAD = 0.15
 _BROW, _FRINGE = 0.13, (0.16, 0.30)
 """In distances between the eyes' outer corners, but for the second row: shares of the way to the face's outline."""
 
+_HANGS = 0.1, 0.5  # shares of hair over the brows between which a fringe begins
+
 _FRAMES = (0.05, 0.08, 0.36, 0.44)  # from the eyes' landmarks
 _LID, _LID_BROW, _RIM = (0.01, 0.03, 0.10, 0.15), (0.06, 0.10), (0.02, 0.05)
 """In the same distances: from the upper lid's edge, from a brow, and from what is no skin beside it."""
-_SHADOW = 5  # pixels of the network's crop across which hair darkens skin
+_SHADOW, _DOUBT = 5, 11  # pixels of the network's crop: across which hair covers skin, and may darken it
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,6 +87,7 @@ class ShownParts:
     own: Tensor  # the person's skin, brows, eyes, lips, teeth, beard: all that is painted on the head
     bare: Tensor  # skin alone
     hair: Tensor  # hair, the beard not
+    doubt: Tensor  # how much skin there may lie in the shadow of hair
 
     @staticmethod
     def of(parts: FaceParts | None, pixels: Tensor, places: FacePlaces, graph: VertexGraph) -> "ShownParts":
@@ -96,21 +99,26 @@ class ShownParts:
         falloff = (1 - _ramp(below, *_NECK)) * (1 - _ramp(places.behind, *_BEHIND))
         if parts is None:
             inside = (places.out < 1).double() * falloff
-            return ShownParts(inside, inside, torch.zeros_like(inside))
+            return ShownParts(inside, inside, torch.zeros_like(inside), torch.zeros_like(inside))
         bare, features, hair = (
             parts.at(pixels, *names).double().nan_to_num(0.0) for names in (("skin",), _FEATURES, ("hair",))
         )
         # Thick brows and beards look like hair; where hair hangs over the brows too there is a fringe.
         above = places.place[:, 1] - places.brows
-        fringe = hair[(above > _FRINGE[0]) & (above < _FRINGE[1]) & (places.out < 1)].mean().nan_to_num(1.0)
+        fringe = _ramp(
+            hair[(above > _FRINGE[0]) & (above < _FRINGE[1]) & (places.out < 1)].mean().nan_to_num(1.0), *_HANGS
+        )
         grown = hair * _ramp(_NOSE - places.place[:, 1], 0.0, 0.1) * (places.out < 1)
         grown = torch.maximum(grown, hair * places.brow * (1 - fringe))
         # What lies beside hair is in its shadow, and between strands of a fringe is no skin to be painted.
+        over = places.place[:, 1] > _NOSE
         wide = replace(parts, shares=max_pool2d(parts.shares[None], _SHADOW, 1, _SHADOW // 2)[0])
-        shaded = wide.at(pixels, "hair").double().nan_to_num(0.0) * (places.place[:, 1] > _NOSE) * ~places.brow
-        seen = (bare * (1 - shaded) + features + grown) * falloff
+        shaded = wide.at(pixels, "hair").double().nan_to_num(0.0) * over * (1 - (1 - fringe) * places.brow)
+        wider = avg_pool2d(max_pool2d(parts.shares[None], _DOUBT, 1, _DOUBT // 2), _DOUBT, 1, _DOUBT // 2)[0]
+        doubt = replace(parts, shares=wider).at(pixels, "hair").double().nan_to_num(0.0) * over
+        seen = (bare * (1 - shaded) + features * (1 - shaded * (1 - features)) + grown) * falloff
         own = graph.smoothed(seen[:, None], torch.ones_like(bare), 2)[:, 0]
-        return ShownParts(own, bare * falloff, hair - grown)
+        return ShownParts(own, bare * falloff, hair - grown, doubt)
 
 
 def _upper_lids(place: Tensor, at: Tensor) -> Tensor:

@@ -101,7 +101,7 @@ def photo_texture(
     if base is not None and base.shape != mesh.vertices.shape:
         raise ShapeError(f"base: found {tuple(base.shape)}, expected {tuple(mesh.vertices.shape)}")
     vertices, faces = surfaces[0].vertices, mesh.faces.cpu()
-    graph = VertexGraph(faces, len(vertices))
+    graph = VertexGraph(faces, len(vertices), vertices)
     at_vertices = [
         surface.shown_in(image, camera) for surface, image, camera in zip(surfaces, images, cameras, strict=True)
     ]
@@ -264,8 +264,10 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
         weight = graph.smoothed(typical[:, None], torch.ones_like(covered), _BROAD)
         seen_color = torch.lerp(mean, graph.smoothed(seen_color, typical, _BROAD), weight / (weight + _SPARSE))
     under = torch.where(fixed, seen_color, mean)
-    lost = _HEAT_LOSS_AT_MASK if masked else _HEAT_LOSS
-    for _ in range(0 if bool(fixed.all()) else _FILL):  # heat that flows from what is covered; behind a mask it is lost
+    lost = (_HEAT_LOSS_AT_MASK if masked else _HEAT_LOSS) / graph.finer
+    for _ in range(
+        0 if bool(fixed.all()) else graph.rounds(_FILL)
+    ):  # heat that flows from what is covered; behind a mask it is lost
         under = torch.where(fixed, under, torch.lerp(graph.sum(under) / graph.degree[:, None], mean, lost))
     return guess + (1 - covered)[:, None] * under
 

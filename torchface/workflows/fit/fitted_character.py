@@ -4,8 +4,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import cv2
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,6 +13,7 @@ from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.mesh import Mesh
 from torchface.modeling import ImageFit
 from torchface.modeling.photographs.eye_color import IRIS_WIDTH, with_iris
+from torchface.modeling.photographs.hair_cap import hangs_down
 from torchface.modeling.photographs.image_texture import without_colors
 from torchface.modeling.photographs.skin_light import exposed
 from torchface.registration import hidden_parts, with_template_skin
@@ -23,12 +22,6 @@ from torchface.synthetic.head.embedded_character import character
 from torchface.synthetic.head.skin_maps import Look
 from torchface.synthetic.head.skin_texture import IRIS_EDGE
 
-# In distances between the eyes' outer corners: how far from the face's middle hair hangs beside the neck, and how far
-# below the mouth.
-_BESIDE, _BELOW = (0.55, 1.15), (0.15, 0.75)
-_LONG = 0.25  # share of hair there on one side
-_FAR = 0.5  # width of a turned face's far side beside the near one's
-_HAIR, _TUFT = 0.5, 30  # share, and pixels of the crop
 _SIZE = 1024
 _CLOTH, _LEAST = 0.7, 150  # share and crop's pixels
 # Of teeth and whites of eyes: share and crop's pixels, which quantile of the pixels, the usual brightness of those
@@ -118,47 +111,6 @@ def _pixels(images: Sequence[Tensor], parts: Sequence[FaceParts], name: str, sha
         crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), shown.transform, shown.shares.shape[-1])
         seen.append(crop[:, shown.of(name) > share].float() / 255)
     return torch.cat(seen, 1)
-
-
-def hangs_down(parts: Sequence[FaceParts], marks: Tensor) -> bool:
-    """Whether photographs, with landmarks (I,68,2), show hair beside the neck that grows on the head.
-
-    Of a face that is turned the near side counts: beside the other lies what stands behind the head.
-    """
-    found = []
-    for shown, points in zip(parts, marks.double(), strict=True):
-        across = points[42:48].nanmean(0) - points[36:42].nanmean(0)
-        unit = across * (points[45] - points[36]).norm().nan_to_num(float(1.45 * across.norm())) / across.norm()
-        down = torch.stack([-unit[1], unit[0]])
-        sides = torch.linspace(*_BESIDE, 9, dtype=torch.float64)
-        below = torch.linspace(*_BELOW, 9, dtype=torch.float64)
-        mouth = points[48:].nanmean(0)
-        grown = replace(shown, shares=shown.shares * _grown(shown, points))
-        left, right = (
-            grown.at(mouth + side * sides[:, None, None] * unit + below[:, None] * down, "hair").nanmean().nan_to_num(0)
-            for side in (-1, 1)
-        )
-        jaw = torch.stack([points[:3].nanmean(0), points[14:17].nanmean(0)])
-        widths = ((points[30] - jaw) @ across).abs().nan_to_num(0.0)
-        turned = [bool(widths[k] < _FAR * widths[1 - k]) for k in (0, 1)]
-        found.append(right if turned[0] else left if turned[1] else torch.maximum(left, right))
-    return float(torch.stack(found).median()) > _LONG
-
-
-def _grown(shown: FaceParts, points: Tensor) -> Tensor:
-    """Which pixels (S,S) of a crop belong to hair that is one with hair over the brows' middle, landmarks (68,2).
-
-    What reaches over them beside the head alone is a curtain or a wall.
-    """
-    hair = cv2.erode((shown.of("hair") > _HAIR).numpy().astype(np.uint8), np.ones((3, 3), np.uint8))
-    _, label = cv2.connectedComponents(hair, connectivity=4)
-    brows = points[17:27] @ shown.transform[:, :2].T + shown.transform[:, 2]
-    high = int(brows[:, 1].nan_to_num(0.0).amin().clamp(0, len(label)))
-    left, right = brows[:, 0].nan_to_num(0.0).aminmax()
-    over = label[:high, max(0, int(left)) : max(1, int(right))]
-    names, counts = np.unique(over, return_counts=True)
-    on_head = [name for name, count in zip(names, counts, strict=True) if name and count > _TUFT]
-    return torch.from_numpy(cv2.dilate(np.isin(label, on_head).astype(np.uint8), np.ones((3, 3), np.uint8)))
 
 
 def _cloth(images: Sequence[Tensor], parts: Sequence[FaceParts]) -> Tensor | None:

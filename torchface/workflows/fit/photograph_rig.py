@@ -50,7 +50,14 @@ from torchface.workflows.fit.fit_landmarks import (
 )
 from torchface.workflows.fit.fit_readings import with_readings
 from torchface.workflows.fit.fitted_character import dressed_rig
-from torchface.workflows.fit.picture_checks import color_lines, cover_lines, light_lines, picture_lines, profile_lines
+from torchface.workflows.fit.picture_checks import (
+    TOO_DARK,
+    color_lines,
+    cover_lines,
+    light_lines,
+    picture_lines,
+    profile_lines,
+)
 from torchface.workflows.fit.video_pictures import video_pictures
 from torchface.workflows.named_finders import part_finder
 from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
@@ -112,8 +119,10 @@ class FittedHead:
         look = f"look at {self.overlays[0].name} first" if self.overlays else "look at the rig first"
         warned = sum(line.startswith("WARNING") for line in self.remarks)
         stray = any(NO_FACE_THERE in line for line in self.remarks)
-        word = "poor" if off > _POOR or stray else "partly usable" if warned else "good"
+        dark = any(TOO_DARK in line for line in self.remarks)
+        word = "poor" if off > _POOR or stray or dark else "partly usable" if warned else "good"
         word += ", the given landmarks are not on a face that is found" if stray else ""
+        word += ", too dark to show the skin's colour" if dark else ""
         more = f"; {warned} {'warnings' if warned > 1 else 'warning'} below" if warned else ""
         return f"result: {word}, {fit} (at most {_POOR:.0%} is usual){more}; {look}"
 

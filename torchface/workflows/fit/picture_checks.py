@@ -43,6 +43,8 @@ _FLAT_GREY = 0.18  # share of pixels like their neighbours; 9 photographs at mos
 _CHEEK = 0.14  # of the distance of the eyes' outer corners
 _ONE_SIDE, _TWO_HUES = 2.5, 1.6  # factors; of 5 photographs 1.0 to 1.15 and 1.0 to 1.25, of a patchy one 1.5 and 2.1
 _DEVELOPED, _TOO_DARK = 1.4, 5.0  # factors of light
+TOO_DARK = "too dark"
+"""In lines on photographs from which skin cannot be told: such a fit is poor."""
 _PROFILE = 50.0  # degrees
 _GRID = 40
 _COVERS = {
@@ -128,9 +130,9 @@ def light_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Te
     lines, gain, needed = list[str](), exposure_gain(image, parts), needed_gain(image, parts)
     if needed > _TOO_DARK:
         lines.append(
-            f"WARNING: {photograph.name}: too dark: it shows 1/{needed:.0f} of the light of a well exposed photograph, "
-            f"expected at least 1/{_TOO_DARK:.0f}; its light is multiplied by {gain:.1f} only, so the painted skin is "
-            f"too dark; give a photograph in good light"
+            f"WARNING: {photograph.name}: {TOO_DARK}: it shows 1/{needed:.0f} of the light of a well exposed "
+            f"photograph, expected at least 1/{_TOO_DARK:.0f}; its light is multiplied by {gain:.1f} only, so the "
+            f"painted skin is too dark; give a photograph in good light"
         )
     elif gain > _DEVELOPED:
         lines.append(
