@@ -45,3 +45,18 @@ def test_markers_named_so_come_back(name: str, tmp_path: Path) -> None:
     save_take(take, tmp_path / "take.csv")
     found = load_take(tmp_path / "take.csv").markers
     assert found.names == (name,)
+
+
+@pytest.mark.parametrize("kind", ["semicolons", "UTF-16", "trailing"])
+def test_tables_of_other_programs_are_read(kind: str, tmp_path: Path) -> None:
+    """Decimal commas between semicolons, UTF-16 as Windows writes it, a comma at the end of each row."""
+    text = "frame,time,jawOpen\n0,0.0,0.25\n1,0.04,-1.5e-1\n"
+    changed = {
+        "semicolons": text.replace(",", ";").replace(".", ",").encode(),
+        "UTF-16": text.encode("utf-16"),
+        "trailing": text.replace("\n", ",\r\n").encode(),
+    }
+    (tmp_path / "take.csv").write_bytes(changed[kind])
+    table = TableReader(tmp_path / "take.csv").read()
+    assert table.names == ("frame", "time", "jawOpen")
+    assert table.numbers.tolist() == [[0, 0, 0.25], [1, 0.04, -0.15]]

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from mutation import check_reader
 from take_strategies import check_refused, round_trip, same, weight_takes
 
-from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.take_files import load_take, save_take
 from torchface.io.weights.live_link_csv import load_live_link, save_live_link
 from torchface.io.weights.weight_csv import ROTATIONS
@@ -154,7 +154,6 @@ def test_a_frame_without_a_face_is_nan(commas: int, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("JawOpen", "JawAjar", r"found no column 'jawOpen', expected Timecode, BlendshapeCount and ARKit's 52"),
         ("Timecode", "Time", r"found no column 'Timecode'"),
         ("JawOpen", "EyeBlinkLeft", r"found more than one column 'EyeBlinkLeft'"),
         ("HeadYaw", "headPitch", r"found columns .* differ in case only"),
@@ -170,6 +169,24 @@ def test_a_frame_without_a_face_is_nan(commas: int, tmp_path: Path) -> None:
 )
 def test_a_broken_file_is_refused_by_name(old: str, new: str, message: str, tmp_path: Path) -> None:
     check_refused(load_take, tmp_path / "broken.csv", _text(tmp_path), (old, new), message)
+
+
+def test_columns_that_are_missing_are_read_as_0_and_named(tmp_path: Path) -> None:
+    rows = [line.split(",") for line in _text(tmp_path).splitlines()]
+    whole = load_take(tmp_path / "good.csv")
+    kept = [i for i, name in enumerate(rows[0]) if name not in ("JawOpen", "TongueOut")]
+    fewer = tmp_path / "fewer.csv"
+    fewer.write_text("\n".join(",".join(row[i] for i in kept) for row in rows))
+    with pytest.warns(UserWarning, match=r"found no column 'JawOpen', 'TongueOut': those weights are read as 0"):
+        found = load_take(fewer)
+    there = [name for name in whole.weights.names if name not in ("JawOpen", "TongueOut")]
+    assert torch.equal(found.weights.select(there).values, whole.weights.select(there).values)
+    assert found.weights.names[-2:] == ("JawOpen", "TongueOut")
+    assert not found.weights.values[:, -2:].any()
+    few = [rows[0].index(name) for name in ("Timecode", "BlendshapeCount", "JawOpen")]
+    fewer.write_text("\n".join(",".join(row[i] for i in few) for row in rows))
+    with pytest.raises(FileFormatError, match=r"found no column .* expected Timecode, BlendshapeCount and ARKit's 52"):
+        load_take(fewer)
 
 
 def test_what_cannot_be_written_is_refused(tmp_path: Path) -> None:

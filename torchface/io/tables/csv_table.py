@@ -1,5 +1,6 @@
 """Comma-separated tables of numbers: every cell is checked, and a fault is named by row and column."""
 
+import codecs
 import csv
 import io
 import re
@@ -8,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -51,13 +53,22 @@ class Table:
 
 
 class TableReader:
-    """A UTF-8 file whose first row, the header, is read, and whose other rows are read once their columns are known."""
+    """A file whose first row, the header, is read, and whose other rows are read once their columns are known.
+
+    Commas stand between cells; or semicolons, as where numbers have decimal commas, which are read too. Rows may all
+    end in empty cells that have no name.
+    """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._lines = TextLines(self.path, read_file(path, MAX_TABLE_BYTES))
-        self._rows = csv.reader(self._lines)
-        self.header = tuple(_unescaped(cell.strip()) for cell in self._next() or ())
+        first = next(self._lines, "")
+        self._semicolons = ";" in first and "," not in first
+        self._rows = csv.reader(chain([first], self._lines), delimiter=";" if self._semicolons else ",")
+        header = [_unescaped(cell.strip()) for cell in self._next() or ()]
+        while header and not header[-1]:
+            header.pop()
+        self.header = tuple(header)
         if not any(self.header):
             raise FileFormatError(f"{path}: found no header, expected the names of the columns in the first row")
         twice = [name for name, count in Counter(self.header).items() if count > 1]
@@ -99,6 +110,8 @@ class TableReader:
         while (cells := self._next()) is not None:
             if not cells:
                 continue
+            if len(cells) > width and not any(cells[width:]):
+                del cells[width:]
             if len(cells) < width and is_blank(cells):
                 cells += [""] * (width - len(cells))
             if len(cells) != width:
@@ -108,7 +121,7 @@ class TableReader:
             for i in text_columns:
                 text = _unescaped(cells[i].strip())
                 text_cells[self.header[i]].append(text if len(text) > _SHARED_TEXT else shared.setdefault(text, text))
-            wanted = [cells[i] for i in number_columns]
+            wanted = [cells[i].replace(",", ".") if self._semicolons else cells[i] for i in number_columns]
             numbers.extend(parse_numbers(wanted, names, f"{self.path}: row {self._rows.line_num}"))
             rows += 1
         if rows == 0:
@@ -121,11 +134,13 @@ class TableReader:
 
 
 class TextLines:
-    """The lines of a UTF-8 file with their ends, decoded as they are asked for."""
+    """The lines of a file in UTF-8, or UTF-16 that says so, with their ends, decoded as they are asked for."""
 
     def __init__(self, path: Path, data: bytes, newline: str = "") -> None:
         self.path = path
-        self._file = io.TextIOWrapper(io.BytesIO(data), "utf-8-sig", newline=newline)
+        self._kind = "UTF-16" if data[:2] in (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE) else "UTF-8"
+        encoding = "utf-8-sig" if self._kind == "UTF-8" else self._kind
+        self._file = io.TextIOWrapper(io.BytesIO(data), encoding, newline=newline)
         self._row_size = 0
 
     def row_begins(self) -> None:
@@ -140,7 +155,7 @@ class TextLines:
             line = self._file.readline(_MAX_ROW + 1)
         except UnicodeDecodeError as error:
             raise FileFormatError(
-                f"{self.path}: found bytes that are no UTF-8 ({error.reason}), expected a table"
+                f"{self.path}: found bytes that are no {self._kind} ({error.reason}), expected a table"
             ) from error
         self._row_size += len(line)
         if self._row_size > _MAX_ROW:

@@ -1,5 +1,6 @@
 """Live Link Face's CSV: timecode, ARKit's 52 weights, head and eye rotations."""
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,7 @@ from torchface.shape_names import ARKIT, mapping
 from torchface.take import Take, Track
 
 _TIMECODE, _COUNT = "timecode", "blendshapecount"
+_MOST_LACKING = len(ARKIT) // 2  # columns of another kind of file
 _SHAPES = {name.lower() for name in ARKIT}
 
 
@@ -48,7 +50,8 @@ def load_live_link(path: str | Path) -> Take:
     - ``blendshape_count``: the column of that name, one whole number a frame;
     - ``measured_fps``: what the clock says before it is rounded to a usual rate.
 
-    Frames that were dropped are not filled: the others keep their times.
+    Frames that were dropped are not filled: the others keep their times. Up to half of the shapes may be missing; they
+    stand last and are 0, with a ``UserWarning``.
 
     Returns:
         weights (T,52,1), float32, which holds the app's ten decimals without loss; ``timecode``; ``extras``.
@@ -59,10 +62,13 @@ def load_live_link(path: str | Path) -> Take:
     reader = TableReader(path)
     spelling = {name.lower(): name for name in reader.header}
     missing = [name for name in ("Timecode", "BlendshapeCount", *ARKIT) if name.lower() not in spelling]
-    if missing:
+    lacking = [name[0].upper() + name[1:] for name in missing if name in ARKIT]
+    if len(missing) > len(lacking) or len(lacking) > _MOST_LACKING:
         raise FileFormatError(
             f"{path}: found no column {quoted(missing)}, expected Timecode, BlendshapeCount and ARKit's 52 shapes"
         )
+    if lacking:
+        warnings.warn(f"{path}: found no column {quoted(lacking, 10)}: those weights are read as 0", stacklevel=3)
     if len(spelling) < len(reader.header) or "" in spelling:
         raise FileFormatError(
             f"{path}: found columns without a name, or whose names differ in case only; expected one each"
@@ -84,9 +90,15 @@ def load_live_link(path: str | Path) -> Take:
         "blendshape_count": _counts(table.texts[spelling[_COUNT]], path),
         "measured_fps": timing.measured,
     }
-    weights = torch.from_numpy(table.columns(names, np.float32))[..., None]
+    values = table.columns(names, np.float32)
+    unseen = np.isnan(values).all(1, keepdims=True)
+    weights = torch.from_numpy(np.hstack([values, *[np.where(unseen, np.float32(np.nan), 0)] * len(lacking)]))[
+        ..., None
+    ]
     timecode = table.texts[spelling[_TIMECODE]]
-    return Take(timing.fps, weights=Track(names, weights), timecode=timecode, extras=extras, seconds=timing.seconds)
+    return Take(
+        timing.fps, weights=Track((*names, *lacking), weights), timecode=timecode, extras=extras, seconds=timing.seconds
+    )
 
 
 def _numbers_or_texts(cells: tuple[str, ...]) -> torch.Tensor | tuple[str, ...]:
