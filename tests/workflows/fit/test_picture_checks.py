@@ -23,6 +23,7 @@ from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, find_in_p
 from torchface.workflows.fit.picture_checks import (
     color_lines,
     cover_lines,
+    edge_lines,
     light_lines,
     picture_lines,
     profile_lines,
@@ -139,6 +140,20 @@ def test_what_stands_before_a_face_is_said_with_its_share(part: str, least: str)
 
     assert lines(0) == lines(2) == []
     assert lines(20) == [f"WARNING: a.png: {least} 20% of the face; its skin there is completed"]
+
+
+def test_a_face_that_the_pictures_edge_cuts_is_no_face_behind_a_hand() -> None:
+    marks = torch.full((68, 2), 50.0)
+    assert edge_lines(Path("a.png"), (100, 100), marks) == []
+    marks[:5, 0] = torch.tensor([-3.0, -0.4, 99.4, 99.6, torch.nan])
+    (line,) = edge_lines(Path("a.png"), (100, 100), marks)
+    assert "edge cuts off the face (2 of 68 landmarks" in line
+    shares = torch.zeros(len(PARTS), 100, 100)
+    shares[PARTS.index("hand")] = 1.0
+    parts = FaceParts(shares, torch.eye(2, 3, dtype=torch.float64))
+    square = torch.tensor([[20.0, 20.0], [20.0, 80.0], [80.0, 80.0], [80.0, 20.0]])
+    assert cover_lines(Path("a.png"), parts, square)
+    assert cover_lines(Path("a.png"), parts, square, cut=True) == []
 
 
 def test_landmarks_that_no_head_has_are_remarked_on() -> None:

@@ -54,6 +54,7 @@ from torchface.workflows.fit.picture_checks import (
     TOO_DARK,
     color_lines,
     cover_lines,
+    edge_lines,
     light_lines,
     picture_lines,
     profile_lines,
@@ -226,9 +227,11 @@ def fit_photographs(
         readings = FaceReading.stacked([one.face for one in found])
         fitting = with_readings(fitting, readings, found[0].places, rig)
     remarks = [line for one in found for line in picture_lines(one, insist)]
-    for photograph, image, shown, points in zip(photographs, images, parts, marks, strict=True):
+    whole = [one.face.landmarks for one in found] or marks
+    for photograph, image, shown, points, every in zip(photographs, images, parts, marks, whole, strict=True):
+        edge = edge_lines(photograph, (image.shape[2], image.shape[1]), every)
         remarks += color_lines(photograph, image, shown, points) if found else []
-        remarks += cover_lines(photograph, shown, points)
+        remarks += [*edge, *cover_lines(photograph, shown, points, bool(edge))]
         remarks += [] if settings.everything else light_lines(photograph, image, shown, points)
     # The tracker has followed one face through a film.
     remarks += one_person_lines(photographs, marks, bare, insist or one_film, OTHERS if one_film else ONE_PERSON)

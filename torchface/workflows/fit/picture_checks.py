@@ -114,11 +114,27 @@ def profile_lines(fit: ImageFit) -> list[str]:
     return []
 
 
-def cover_lines(photograph: Path, parts: FaceParts, landmarks: Tensor) -> list[str]:
-    """What stands before a face with landmarks (68,2), for people to read; nothing where nothing does."""
+def edge_lines(photograph: Path, size: tuple[int, int], landmarks: Tensor) -> list[str]:
+    """Whether a photograph's edge cuts off a face with landmarks (68,2), also beyond it, for people to read."""
+    beyond = int(((landmarks < -0.5) | (landmarks > landmarks.new_tensor(size) - 0.5)).any(-1).sum())
+    if not beyond:
+        return []
+    return [
+        f"WARNING: {photograph.name}: the picture's edge cuts off the face ({beyond} of {len(landmarks)} landmarks lie "
+        "beyond it): there the head is the model's guess; give a picture of the whole face"
+    ]
+
+
+def cover_lines(photograph: Path, parts: FaceParts, landmarks: Tensor, cut: bool = False) -> list[str]:
+    """What stands before a face with landmarks (68,2), for people to read; nothing where nothing does.
+
+    A picture's edge that cuts the face is no hand, for which the network takes it.
+    """
     face = _inside(parts, landmarks)
     lines = []
     for name, (least, words) in _COVERS.items():
+        if cut and name == "hand":
+            continue
         share = float(parts.of(name)[face].mean())
         if share > least:
             lines.append(f"WARNING: {photograph.name}: {words} {share:.0%} of the face; its skin there is completed")
