@@ -123,6 +123,19 @@ def test_skin_under_hair_is_skin_in_spite_of_its_shadow_and_of_a_templates_hair(
         assert float((found[where] - SKIN).norm(dim=1).quantile(0.95)) < 0.06
 
 
+def test_of_three_photographs_one_with_a_filter_counts_where_no_other_shows_the_head(
+    head: Mesh, camera: Camera
+) -> None:
+    picture = render(head, camera, lighting=EVEN, samples=1)
+    sepia = (picture * torch.tensor([1.1, 0.9, 0.3])[:, None, None]).clamp(max=1)
+    parts = [planted_parts(one, {"background": torch.zeros(3)}, 0.05) for one in (picture, picture, sepia)]
+    settings = FitSettings(texture_size=128, parts=parts)
+    plain = photographed_skin([head] * 2, None, [picture] * 2, [camera] * 2, replace(settings, parts=parts[:2]))
+    found = photographed_skin([head] * 3, None, [picture, picture, sepia], [camera] * 3, settings)
+    cheeks = FacePlaces.of(head).cheeks
+    assert float((found.colors - plain.colors)[cheeks].norm(dim=1).mean()) < 0.01
+
+
 def test_a_hard_shadow_on_the_face_is_taken_away_and_a_mole_is_not(head: Mesh, camera: Camera) -> None:
     places = FacePlaces.of(head)
     shade = torch.where(places.place[:, :1] > 0.1, torch.tensor([0.75, 0.6, 0.4]), torch.tensor([1.0, 1.0, 1.0]))

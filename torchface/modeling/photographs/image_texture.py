@@ -41,6 +41,7 @@ _BROWS = 0.5  # share of a brow that photographs show
 # In distances of the eyes' outer corners: behind the ears' landmarks, and before them so far over the eyes, hair may
 # grow. Logarithms of colours by which shades of skin differ.
 _SCALP, _AS_DARK = (0.35, -0.3, -0.5), 0.12
+_FEWEST, _FILTERED = 3, 0.3  # photographs of which one is odd, by logarithms of its channels
 _PUPIL = 0.38  # of the iris
 _LID_SHADOW = 0.5  # of the eye's opening
 _TONE, _SEAM = 40, 16  # rounds over the mesh: the skin around, and the band in which what is completed begins
@@ -124,10 +125,13 @@ def photographed_skin(
         lights = [view.light for view in views]
         if parts is not None:
             mirror = None if mesh.annotations is None else mesh.annotations.mirror
+            odd = _filtered(views)
             views = [_without_patches(view, base, graph, others, mirror) for view in views]
             images, patches = [view.image for view in views], [view.patch for view in views]
             places = [view.places for view in views]
             confidence = torch.stack([view.parts.own * _like_skin(view, graph) for view in views])
+            plain = torch.stack([(view.shown.cosine > _SQUARE) for view in views]) * confidence * ~odd[:, None]
+            confidence = torch.where(odd[:, None], confidence * (1 - plain.amax(0)), confidence)
             if base is not None:
                 base = _bare(base, places[0], graph, float(confidence[:, places[0].brow].amax(0).mean()) > _BROWS)
             hair = torch.where(others, 0.0, torch.stack([view.parts.hair for view in views]))
@@ -261,6 +265,16 @@ def _without_sharp_shadows(
         image = torch.lerp(image, like_skin_around(image, at[:, :3], *most), at[:, 3:])
         colors = torch.lerp(colors, like_skin_around(colors, tone, *most), weight.double()[:, None])
     return replace(texture, image=texture.texels.image(image.clamp(0, 1)), colors=colors.float())
+
+
+def _filtered(views: Sequence[_View]) -> Tensor:
+    """Which photographs show skin of another hue than most, as one with a filter does, (I,) bool."""
+    bare = [view.parts.bare > _BARE for view in views]
+    if len(views) < _FEWEST or not all(bool(one.any()) for one in bare):
+        return torch.zeros(len(views), dtype=torch.bool)
+    logs = [view.shown.colors[one].double().clamp(min=_DARK).log() for view, one in zip(views, bare, strict=True)]
+    hues = torch.stack([one.median(0).values - one.median(0).values.mean() for one in logs])
+    return (hues - hues.median(0).values).norm(dim=1) > _FILTERED
 
 
 def _bare(colors: Tensor, places: FacePlaces, graph: VertexGraph, brows: bool) -> Tensor:
