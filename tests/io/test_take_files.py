@@ -112,9 +112,9 @@ def test_usual_units_and_single_wild_frames_stay(tmp_path: Path) -> None:
     columns = {name: column.repeat(3) for name, column in take.extras["columns"].items()}
     columns["HeadYaw"][3] = 50.0
     save_take(Take(60.0, weights=Track(("one", "two"), values), extras={"columns": columns}), tmp_path / "take.csv")
-    with pytest.warns(UserWarning, match=r"found weights from 0\.?\d* to 80, usual are 0 to 1") as told:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
         found = load_take(tmp_path / "take.csv")
-    assert len(told) == 1
     assert found.weights.values.equal(values)
     assert found.extras["columns"]["HeadYaw"].equal(columns["HeadYaw"])
 

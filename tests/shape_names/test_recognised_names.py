@@ -1,8 +1,19 @@
 """Names of other programs are ARKit's shapes, and no others are."""
 
 import pytest
+import torch
 
-from torchface.shape_names import ARKIT, METAHUMAN, UNIFIED, VISEMES, VRM0, VRM1, arkit_name, recognised_shapes
+from torchface.shape_names import (
+    ARKIT,
+    METAHUMAN,
+    UNIFIED,
+    VISEMES,
+    VRM0,
+    VRM1,
+    arkit_name,
+    recognised_mapping,
+    recognised_shapes,
+)
 
 CC4 = [
     "A01_Brow_Inner_Up",
@@ -135,3 +146,30 @@ def test_unified_expressions_that_mean_the_same_are_read_the_same() -> None:
         for twin in twins:
             found = arkit_name(twin)
             assert found is None or found.startswith(arkit), (twin, found, arkit)
+
+
+@pytest.mark.parametrize("form", ["Head_blendShape1.{}", "bs_{}_Mesh", "Char_{}_shape", "{}"])
+def test_rigs_that_add_to_all_names_are_driven_by_arkit(form: str) -> None:
+    plain = [*ARKIT, "pupilDilate"]
+    matrix = recognised_mapping(plain, [form.format(name) for name in plain])
+    assert torch.equal(matrix, torch.eye(len(plain)))
+    assert torch.equal(recognised_mapping([form.format(name) for name in plain], plain), matrix)
+
+
+def test_sides_in_front_and_shared_by_all_stay() -> None:
+    assert recognised_mapping(["browDownLeft", "browDownRight"], ["l_browDown"]).tolist() == [[1, 0]]
+    left = ["eyeBlink_L", "browDown_L"]
+    assert recognised_mapping(["eyeBlinkRight", "browDownRight"], left).tolist() == [[0, 0], [0, 0]]
+    assert recognised_mapping(left, ["l_eyeBlink", "l_browDown"]).tolist() == [[1, 0], [0, 1]]
+
+
+def test_metahumans_curves_are_driven_by_its_table_and_drive() -> None:
+    assert torch.equal(recognised_mapping(ARKIT, METAHUMAN.names), METAHUMAN.from_arkit(torch.eye(len(ARKIT))).T)
+    assert torch.equal(
+        recognised_mapping(METAHUMAN.names, ARKIT), METAHUMAN.to_arkit(torch.eye(len(METAHUMAN.names))).T
+    )
+
+
+def test_of_two_shapes_for_one_motion_one_is_driven() -> None:
+    assert recognised_mapping(["jawOpen"], ["Jaw_Open", "jawOpen"]).tolist() == [[0], [1]]
+    assert recognised_mapping(["jawOpen"], ["Jaw_Open", "A25_Jaw_Open"]).tolist() == [[1], [0]]

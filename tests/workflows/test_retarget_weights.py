@@ -49,6 +49,15 @@ def test_a_target_of_another_unit_is_said_with_its_size(tmp_path: Path) -> None:
     assert done.warnings[0].startswith(f"{tmp_path / 'large.glb'}: {size:,.4g} mm, expected 80 to 700 of a head")
 
 
+def test_most_shapes_without_a_name_on_the_target_are_counted(tmp_path: Path) -> None:
+    rig = performer(texture=False).select(["jawOpen"])
+    save_rig(rig, tmp_path / "rig.glb")
+    names = ("jawOpen", "Maw", "Snout", "Horns")
+    save_take(Take(60.0, weights=Track(names, torch.tensor([[0.5, 0.5, 0.5, 0.0]])[..., None])), tmp_path / "take.csv")
+    done = retarget_weights(tmp_path / "take.csv", tmp_path / "rig.glb", WeightFiles(tmp_path / "out.csv"))
+    assert any("only 1 of the 3 shapes that move in" in warning for warning in done.warnings)
+
+
 def test_a_map_is_learned_from_poses_kept_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     whole = performer(texture=False)
     creature = whole.select(["jawOpen", "mouthPucker", "browInnerUp"])

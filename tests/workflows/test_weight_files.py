@@ -144,7 +144,7 @@ def test_what_is_wrong_with_weights_is_told_by_shape_and_frame() -> None:
     values[4, 1], values[5, 2], values[2, 0] = torch.nan, torch.nan, 7.5
     assert weight_faults(track) == [
         "2 weights are missing, of mouthPucker, eyeBlinkLeft; the first is mouthPucker in frame 4",
-        "1 weights are below 0 or above 1, of jawOpen; the first is jawOpen in frame 2, 7.5",
+        "1 weights are below 0 or above 1 (7.5 to 7.5), of jawOpen; the first is jawOpen in frame 2, 7.5",
     ]
 
 
@@ -182,20 +182,25 @@ def test_missing_weights_are_told_by_every_command(
 
 def test_a_frame_without_a_face_stays_one(stage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     values = torch.zeros(5, 2, 1)
-    values[3], values[1, 0] = torch.nan, 1.5
+    values[3], values[1, 0], values[4, 0] = torch.nan, 1.5, 0.5
     save_weights_csv(Take(30.0, weights=Track(("jawOpen", "browInnerUp"), values)), tmp_path / "gaps.csv")
     words = ["retarget", str(tmp_path / "gaps.csv"), "--to", str(stage / "own.glb"), "--out", str(tmp_path / "out.csv")]
     (tmp_path / "table.toml").write_text("[ctrl_a]\nsum = { jawOpen = 1.0 }\n")
     assert main([*words, "--table", str(tmp_path / "table.toml"), "-q"]) in (0, None)
     shown = " ".join(capsys.readouterr().err.split())
     assert "2 weights are missing, of jawOpen, browInnerUp" in shown
-    assert "1 weights are below 0 or above 1, of jawOpen" in shown
+    assert "1 weights are below 0 or above 1 (1.5 to 1.5), of jawOpen" in shown
     moved = load_take(tmp_path / "out.csv").weights
     assert moved.values.isnan().all(1)[:, 0].tolist() == [False, False, False, True, False]
     assert torch.isfinite(moved.values[[0, 1, 2, 4]]).all()
+    main([*words, "--table", str(tmp_path / "table.toml"), "-q", "--animation", str(tmp_path / "a.glb")])
+    assert "1 frames without a face take what lies between" in " ".join(capsys.readouterr().err.split())
+    played = load_animation(tmp_path / "a.glb").weights
+    assert played.select(["ctrl_a"]).values.flatten().tolist() == pytest.approx([0, 1, 0, 0.25, 0.5])
+    save_weights_csv(Take(30.0, weights=Track(("jawOpen", "browInnerUp"), values * torch.nan)), tmp_path / "gaps.csv")
     with pytest.raises(SystemExit):
         main([*words, "--table", str(tmp_path / "table.toml"), "-q", "--animation", str(tmp_path / "a.glb")])
-    assert "expected numbers for an animation" in " ".join(capsys.readouterr().err.split())
+    assert "expected a frame with a face for an animation" in " ".join(capsys.readouterr().err.split())
 
 
 def test_weights_go_to_a_csv_only(stage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

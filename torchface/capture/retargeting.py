@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value, read_toml, write_toml
-from torchface.shape_names import mapping, near_names, spelled_as
+from torchface.shape_names import mapping, near_names, recognised_mapping, spelled_as
 from torchface.take import Take, Track
 
 __all__ = ["ShapeMap", "ShapeRule", "load_shape_rules", "retarget_take", "save_shape_rules", "shape_map"]
@@ -115,9 +115,10 @@ def shape_map(
     """The map from one rig's shapes to another's: by rules where there are any, else by what the names mean.
 
     Names that mean the same shape match (``eyeBlinkLeft``, ``eyeBlink_L``), a whole shape drives both of its halves,
-    two halves give the whole their mean; see :func:`torchface.shape_names.mapping`. A name of several shapes joined
-    by ``_`` or ``+`` (``jawOpen_mouthSmileLeft``), none of them its own in the source, is a combination shape: their
-    product.
+    two halves give the whole their mean; see :func:`torchface.shape_names.mapping`. So do other programs' names of
+    ARKit's shapes, MetaHuman's curves, and names to which one rig adds the same everywhere. A name of several shapes
+    joined by ``_`` or ``+`` (``jawOpen_mouthSmileLeft``), none of them its own in the source, is a combination shape:
+    their product.
 
     Args:
         from_names: of the weights that are there.
@@ -137,7 +138,7 @@ def shape_map(
     """
     rules = _spelled(rules or {}, from_names, to_names)
     _check_rules(rules, from_names, to_names)
-    matrix = mapping(from_names, to_names)
+    matrix = recognised_mapping(from_names, to_names)
     column = {name: i for i, name in enumerate(from_names)}
     products: list[tuple[int, ...]] = []
     for row, name in enumerate(to_names):

@@ -33,7 +33,6 @@ RECORDING_ENDINGS = (".txt", ".json", ".gesichter")
 LARGEST_WEIGHT = 5.0  # nobody drives a shape so far; where a tenth of the frames do, weights are in percent
 LARGEST_ANGLE = math.pi  # no rotation in radians is larger; where it is in a tenth of the frames, it is in degrees
 
-_BEYOND = 0.01  # of 0 to 1, as calibrated recordings are
 _SHARE, _MOST_PERCENT, _MOST_DEGREES = 0.1, 200.0, 360.0
 
 
@@ -161,11 +160,6 @@ def in_usual_units(take: Take, path: Path) -> Take:
         _warn(path, f"weights up to {most:.4g}", "0 to 1", "percent")
         weights = Track(take.weights.names, take.weights.values / 100, take.weights.confidence)
         take = replace(take, weights=weights)
-    elif take.weights is not None:
-        seen = take.weights.values[torch.isfinite(take.weights.values)]
-        low, high = (float(seen.min()), float(seen.max())) if len(seen) else (0.0, 0.0)
-        if low < -_BEYOND or high > 1 + _BEYOND:
-            warnings.warn(f"{path}: found weights from {low:.3g} to {high:.3g}, usual are 0 to 1", stacklevel=3)
     columns = take.extras.get("columns", {})
     angles = {name: column for name, column in columns.items() if name in ROTATIONS and isinstance(column, Tensor)}
     if angles and (most := _largest(torch.stack(list(angles.values()), 1), LARGEST_ANGLE, _MOST_DEGREES)):

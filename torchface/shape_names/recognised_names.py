@@ -4,8 +4,12 @@ import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cache
+from itertools import takewhile
 
-from torchface.shape_names.arkit_names import ARKIT
+import torch
+from torch import Tensor
+
+from torchface.shape_names.arkit_names import ARKIT, mapping
 from torchface.shape_names.name_tables import METAHUMAN, VRM1
 
 _PREFIX = re.compile(
@@ -17,6 +21,8 @@ _SUFFIX = re.compile(r"(_div\d+|_hd\d*|\.\d{3})$", re.IGNORECASE)
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 _SIDE = {"l": "left", "r": "right", "lt": "left", "rt": "right"}
 _ONE_SIDE = re.compile(r"[_.]([LR])$", re.IGNORECASE)
+_SHARED_PREFIX = re.compile(r"(?:(?!(?:l|r|left|right)[^a-z0-9])[a-z0-9]*[^a-z0-9])+", re.IGNORECASE)
+_SHARED_SUFFIX = re.compile(r"(?:[^a-z0-9](?!(?:l|r|left|right)(?![a-z0-9]))[a-z0-9]+)+$", re.IGNORECASE)
 _SPELLING = {"eyes": "eye", "brows": "brow", "eyebrow": "brow", "eyebrows": "brow", "lips": "lip"}
 
 _SIDED = {
@@ -135,6 +141,50 @@ def recognised_shapes(names: Sequence[str]) -> dict[str, RecognisedShape]:
         if rows:
             found[arkit] = RecognisedShape(rows, tuple(names[i] for i in rows), arkit in row)
     return found
+
+
+def recognised_mapping(from_names: Sequence[str], to_names: Sequence[str]) -> Tensor:
+    """The matrix (N_to,N_from) of :func:`mapping`, which also matches other programs' names of ARKit's shapes, names
+    that all of a rig's begin or end with something, and MetaHuman's curves; to what ``mapping`` leaves alone.
+
+    Example:
+        >>> names = ["Head.jawOpen_Mesh", "Head.eyeBlink_L_Mesh"]
+        >>> recognised_mapping(["eyeBlinkLeft", "jawOpen"], names).tolist()
+        [[0.0, 1.0], [1.0, 0.0]]
+    """
+    matrix = mapping(from_names, to_names)
+    ours, theirs = _read_as_arkit(from_names), _read_as_arkit(to_names)
+    copies = torch.zeros(len(to_names), len(from_names))
+    for arkit, curves in METAHUMAN.twins.items():
+        to_curves = [row for row, name in enumerate(to_names) if name in curves]
+        from_curves = [column for column, name in enumerate(from_names) if name in curves]
+        if to_curves and arkit in ours:
+            copies[to_curves, ours.index(arkit)] = 1.0
+        if from_curves and arkit in theirs:
+            copies[theirs.index(arkit), from_curves] = 1 / len(from_curves)
+    for step in (copies, mapping(ours, theirs)):  # of two shapes for one motion the first alone moves
+        free = ~matrix.any(1, keepdim=True) & ~matrix.any(0, keepdim=True)
+        matrix = torch.where(free, step, matrix)
+    return matrix
+
+
+def _read_as_arkit(names: Sequence[str]) -> tuple[str, ...]:
+    """ARKit's name of each that has one, once each; the others without what all names begin or end with."""
+    names = tuple(names)
+    start, end = _beginning(names), _beginning([name[::-1] for name in names])[::-1]
+    before, after = _SHARED_PREFIX.match(start), _SHARED_SUFFIX.search(end)
+    first, last = before.end() if before and len(names) > 1 else 0, len(after[0]) if after and len(names) > 1 else 0
+    plain = [name[first : len(name) - last] or name for name in names]
+    read: list[str] = []
+    for name, short in zip(names, plain, strict=True):
+        arkit = arkit_name(name) or arkit_name(short)
+        read.append(short if arkit is None or arkit in read else arkit)
+    return tuple(read)
+
+
+def _beginning(names: Sequence[str]) -> str:
+    """The letters that all names begin with."""
+    return "".join(letters[0] for letters in takewhile(lambda row: len(set(row)) == 1, zip(*names, strict=False)))
 
 
 def arkit_count(found: Collection[str], still: Sequence[str]) -> str:

@@ -63,10 +63,8 @@ def retarget_weights(
     assert played.weights is not None
     faults = [f"{weights}: {fault}" for fault in weight_faults(played.weights)]
     faceless = ~torch.isfinite(played.weights.values).flatten(1).any(1)
-    if files.animation is not None and not bool(torch.isfinite(played.weights.values).all()):
-        raise ValueRangeError(
-            f"{faults[0]}; expected numbers for an animation (leave out --animation, or fill them in)"
-        )
+    if files.animation is not None and bool(faceless.all()):
+        raise ValueRangeError(f"{faults[0]}; expected a frame with a face for an animation (leave out --animation)")
     target = load_rig(to, part=part)
     check_live_link(target.names, files.live_link)
     faults += [f"{to}: {fault}, which changes no weight" for fault in size_faults(target.neutral)]
@@ -90,12 +88,27 @@ def retarget_weights(
         shapes = shape_map(played.weights.names, target.names, rules)
     except NameMismatchError as error:
         raise NameMismatchError(f"{table or poses or weights}: {error}") from error
+    faults += _unmatched(played.weights, shapes, weights, to)
     moved, notes = _mouth_closed(retarget_take(played, shapes), rig, target, rules)
     assert moved.weights is not None
     moved.weights.values[faceless] = torch.nan  # of shapes that nothing drives as well
     progress("writing")
     left_out, written = write_weights(moved, files, target, to if part is None else None)
     return Retargeted(moved, shapes, (*faults, *notes, *left_out), (*said, *written))
+
+
+def _unmatched(weights: Track, shapes: ShapeMap, source: Path, target: Path) -> list[str]:
+    """What to say where most of what moves drives nothing."""
+    moving = {
+        name for name, moves in zip(weights.names, (weights.values.nan_to_num() != 0).any(0), strict=True) if moves
+    }
+    lost = moving & set(shapes.unused)
+    if 2 * len(lost) <= len(moving):
+        return []
+    return [
+        f"only {len(moving) - len(lost)} of the {len(moving)} shapes that move in {source} have a name that {target} "
+        "has: the others are lost; give a table of names (--table) or example poses (--poses)"
+    ]
 
 
 def _learned(

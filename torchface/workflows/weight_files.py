@@ -1,10 +1,11 @@
 """Weights on disk as the commands write them."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder, write_file
@@ -19,6 +20,7 @@ from torchface.number_checks import checked_number
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 from torchface.take import Take, Track
+from torchface.temporal.interpolation import values_at
 from torchface.temporal.key_reduction import KeyReduction, kept_keys, reduction_error
 
 _SHOWN = 8
@@ -97,9 +99,10 @@ def weight_faults(weights: Track) -> list[str]:
         shapes = [weights.names[row] for row in wrong.any(0).nonzero()[:, 0].tolist()]
         more = f" and {len(shapes) - _SHOWN} more" if len(shapes) > _SHOWN else ""
         first = "" if what == "missing" else f", {float(values[frame, channel]):g}"
+        span = "" if what == "missing" else f" ({float(values[wrong].min()):.3g} to {float(values[wrong].max()):.3g})"
         lines.append(
-            f"{count} weights are {what}, of {', '.join(shapes[:_SHOWN])}{more}; the first is {weights.names[channel]} "
-            f"in frame {frame}{first}"
+            f"{count} weights are {what}{span}, of {', '.join(shapes[:_SHOWN])}{more}; the first is "
+            f"{weights.names[channel]} in frame {frame}{first}"
         )
     return lines
 
@@ -143,7 +146,10 @@ def write_weights(
         warnings.append(f"{files.live_link} does not give back (halves are merged, others left out): {listed}")
     if files.animation is not None:
         make_folder(files.animation.parent)
-        reduced = write_animation(rig, take, files.animation, files.reduce, source)
+        filled, count = _filled(take)
+        if count:
+            warnings.append(f"{files.animation}: {count} frames without a face take what lies between their neighbours")
+        reduced = write_animation(rig, filled, files.animation, files.reduce, source)
         notes += [] if reduced is None else [f"{files.animation}: {reduced}"]
         if source is not None and source.suffix.lower() == ".gltf":
             warnings.append(
@@ -151,6 +157,23 @@ def write_weights(
                 f"npx @gltf-transform/cli copy {source} {source.with_suffix('.glb')}"
             )
     return warnings, notes
+
+
+def _filled(take: Take) -> tuple[Take, int]:
+    """A take whose frames without weights and rotations have those between the frames beside them, and their number."""
+    assert take.weights is not None
+    seen = torch.isfinite(take.weights.values).flatten(1).all(1).nonzero()[:, 0]
+    if not 0 < len(seen) < len(take):
+        return take, 0
+
+    def filled(values: Tensor) -> Tensor:
+        return values_at(values[seen], take.times[seen], take.times)
+
+    columns = take.extras.get("columns", {})
+    turns = {name: filled(column) for name, column in columns.items() if name in ROTATIONS}
+    extras = take.extras | ({"columns": columns | turns} if turns else {})
+    weights = Track(take.weights.names, filled(take.weights.values))
+    return replace(take, weights=weights, extras=extras), len(take) - len(seen)
 
 
 def write_animation(
