@@ -33,7 +33,7 @@ from torchface.rendering.gaussian_blur import gaussian_blur
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.head.identity import anatomy
-from torchface.workflows.fit.fit_checks import ALONE, one_person_lines
+from torchface.workflows.fit.fit_checks import ALONE, one_person_lines, width_lines
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, check_inside, landmarks_of, warn_if_stored_turned
 from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs
 from torchface.workflows.named_heads import load_head_model, matching
@@ -278,7 +278,8 @@ class People:
         def bare(points: Tensor, rows: list[int]) -> ImageFit:
             return fit_images(self.heads, self.rig, points, [sizes[row] for row in rows], settings=ALONE)
 
-        return one_person_lines(photographs, marks, bare, insist)
+        alone = [bare(marks[i : i + 1], [i]) for i in range(len(marks))]
+        return one_person_lines(photographs, marks, alone, bare, insist)
 
 
 @pytest.fixture(scope="module")
@@ -358,7 +359,19 @@ def test_exact_landmarks_of_one_head_are_of_one_person() -> None:
     def bare(some: Tensor, rows: list[int]) -> ImageFit:
         return fit_images(heads, rig, some, [(464, 580)] * len(rows), settings=ALONE)
 
-    assert one_person_lines([Path(f"{i}.png") for i in range(3)], marks, bare) == []
+    alone = [bare(marks[i : i + 1], [i]) for i in range(3)]
+    assert one_person_lines([Path(f"{i}.png") for i in range(3)], marks, alone, bare) == []
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1.0, ""), (0.75, "narrower"), (1.33, "wider")])
+def test_a_squeezed_or_stretched_photograph_is_remarked_on(factor: float, said: str) -> None:
+    heads, rig = matching(load_head_model("head"))
+    points = rig.vertices[rig.neutral.landmarks].double()
+    marks = look_at(points.mean(0), 5.0, span=300.0, width=464, height=580).project(points)[None]
+    marks[..., 0] *= factor
+    fit = fit_images(heads, rig, marks, (round(factor * 464), 580), settings=ALONE)
+    lines = width_lines([Path("a.png")], [fit], heads, rig.neutral.landmarks)
+    assert (len(lines), said in "".join(lines)) == (int(factor != 1), True)
 
 
 def test_frames_of_a_video_are_fitted(studio: Path, tmp_path: Path) -> None:

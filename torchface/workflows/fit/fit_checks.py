@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError
 from torchface.landmarks import NoFaceError
-from torchface.modeling import FitSettings, ImageFit
+from torchface.modeling import FitSettings, HeadModel, ImageFit
 from torchface.modeling.photographs.landmark_view import JAW
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, find_in_photographs
 
@@ -31,6 +31,9 @@ with found landmarks all were above 0.96 with those modes, but three of turned h
 ALONE = FitSettings(transfers=0, unknown_deviation=0.0, least_noise=0.004)
 """How heads are fitted for these checks, whose limits are of such fits: nothing but the model explains a head. Exact
 landmarks, as of a rendered head, would be sure of coefficients that the model's form of it decides."""
+
+NARROW, WIDE = -2.5, 3.5
+"""Standard deviations of the heads' width beside their height: 24 real faces have -2.3 (seen from the side) to 2.6."""
 
 _NEAR = 0.5
 _FOUND_EYES = 30.0  # pixels between the eyes' outer corners: of 18 faces in groups two smaller ones were not found
@@ -61,14 +64,37 @@ def strange_lines(photographs: Sequence[Path], fit: ImageFit) -> list[str]:
     ]
 
 
+def width_lines(photographs: Sequence[Path], alone: Sequence[ImageFit], model: HeadModel, rows: Tensor) -> list[str]:
+    """Which photographs, each fitted alone with a model's landmark vertices (68,), show a face too narrow or too wide
+    for its height, for people to read."""
+    mean, modes = (part[..., rows, :].double().cpu() for part in (model.shape.mean, model.shape.modes))
+    around = mean - mean.mean(0)
+    spread = (modes * around).sum(1) / around.square().sum(0)  # of each mode along x, y and z, (K,3)
+    wider = (spread[:, 0] - spread[:, 1]) / (spread[:, 0] - spread[:, 1]).norm()
+    lines = []
+    for path, fit in zip(photographs, alone, strict=True):
+        off = float(wider @ fit.coefficients.double())
+        if not NARROW < off < WIDE:
+            lines.append(
+                f"WARNING: {path.name}: its face is {'wider' if off > 0 else 'narrower'} for its height than people's "
+                f"are, by {abs(off):.1f} standard deviations of the head model's (expected {NARROW:g} to {WIDE:g}): "
+                "was the picture squeezed or stretched? Give it in its own proportions"
+            )
+    return lines
+
+
 def one_person_lines(
-    photographs: Sequence[Path], marks: Tensor, bare: BareFit, insist: bool = False, expected: float = ONE_PERSON
+    photographs: Sequence[Path],
+    marks: Tensor,
+    alone: Sequence[ImageFit],
+    bare: BareFit,
+    insist: bool = False,
+    expected: float = ONE_PERSON,
 ) -> list[str]:
     """Whether photographs that were fitted together show one person, for people to read; nothing if that is as
-    likely as expected."""
+    likely as expected. Each is fitted alone too."""
     if len(photographs) < 2:
         return []
-    alone = [bare(marks[i : i + 1], [i]) for i in range(len(marks))]
     sure = same_person(alone).sigmoid()
     worst = int(sure.argmin())
     if float(sure[worst]) >= expected:

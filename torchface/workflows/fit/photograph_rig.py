@@ -39,6 +39,7 @@ from torchface.workflows.fit.fit_checks import (
     landmark_lines,
     one_person_lines,
     strange_lines,
+    width_lines,
 )
 from torchface.workflows.fit.fit_landmarks import (
     DEFAULT_LANDMARKS,
@@ -233,8 +234,11 @@ def fit_photographs(
         remarks += color_lines(photograph, image, shown, points) if found else []
         remarks += [*edge, *cover_lines(photograph, shown, points, bool(edge))]
         remarks += [] if settings.everything else light_lines(photograph, image, shown, points)
+    alone = [bare(marks[i : i + 1], [i]) for i in range(len(marks))]
+    remarks += width_lines(photographs, alone, heads, rig.neutral.landmarks)
     # The tracker has followed one face through a film.
-    remarks += one_person_lines(photographs, marks, bare, insist or one_film, OTHERS if one_film else ONE_PERSON)
+    expected = OTHERS if one_film else ONE_PERSON
+    remarks += one_person_lines(photographs, marks, alone, bare, insist or one_film, expected)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)
     remarks += profile_lines(fit)
     if found:
