@@ -163,6 +163,19 @@ def test_hair_painted_on_a_head_is_left_out_and_its_face_is_not() -> None:
     torch.testing.assert_close(shown[at < 0.2], lips[at < 0.2])
 
 
+def test_light_grey_hair_over_fair_skin_and_before_the_ears_is_left_out() -> None:
+    head = neutral_head()
+    places = FacePlaces.of(head)
+    texels = rasterise_uvs(head.uvs, head.uv_faces, 256, 256)
+    hair = ((places.place[:, 1] > 0.6) | ((places.behind > -0.1) & (places.place[:, 1] > 0.1))).double()
+    at = texels.interpolate(hair[:, None], head.faces)
+    plain = torch.tensor([0.92, 0.70, 0.62])
+    capped = torch.where(at > 0.5, torch.tensor([0.70, 0.67, 0.66]), plain)
+    bare_head = without_painted_hair(replace(head, colors=None, texture=texels.image(capped)))
+    shown = bare_head.texture.flatten(1)[:, texels.texels].T
+    assert float((shown - plain).abs().max()) < 0.02
+
+
 def test_hair_and_clothes_of_a_head_of_track_are_left_out() -> None:
     rig = performer(texture=False)
     notes = rig.neutral.annotations

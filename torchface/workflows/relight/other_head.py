@@ -27,6 +27,11 @@ from torchface.workflows.track.upright_rig import upright
 
 # In distances between the eyes' outer corners; of colours' logarithms; rings of vertices; share; vertices; of white.
 _ABOVE_BROWS, _UNLIKE_SKIN, _HAIR_EDGE, _HALF_HAIR, _FEWEST, _DARK = 0.08, 0.5, 3, 0.2, 20, 0.02
+_GREYER, _BACK, _TEMPLES = (
+    0.2,
+    (0.35, -0.7),
+    (-0.45, -0.2),
+)  # logarithms of hue; behind the ears' landmarks; and over the eyes
 
 
 def other_head(path: Path) -> BlendshapeRig:
@@ -48,18 +53,22 @@ def other_head(path: Path) -> BlendshapeRig:
 
 
 def without_painted_hair(mesh: Mesh) -> Mesh:
-    """A head with the 68 landmarks whose texture shows skin in place of hair above the brows."""
+    """A head with the 68 landmarks whose texture shows skin in place of hair above the brows and about the ears."""
     assert mesh.texture is not None
     assert mesh.uvs is not None
     assert mesh.uv_faces is not None
     places, colors, faces = FacePlaces.of(mesh), vertex_albedo(mesh).double().clamp(min=_DARK), mesh.faces.cpu()
     parts = part_vertices(mesh)
-    forehead = (places.place[:, 1] > places.brows + _ABOVE_BROWS) & ~parts
+    up, behind = places.place[:, 1], places.behind
+    sides = ((behind > _BACK[0]) & (up > _BACK[1])) | ((behind > _TEMPLES[0]) & (up > _TEMPLES[1]))
+    forehead = ((up > places.brows + _ABOVE_BROWS) | (sides & ~places.brow)) & ~parts
     cheeks = places.cheeks & ~parts
     if not cheeks.any():
         return mesh  # nothing says what skin looks like
     skin = colors[cheeks].median(0).values
-    unlike = (colors.log() - skin.log()).norm(dim=1) > _UNLIKE_SKIN
+    apart = colors.log() - skin.log()
+    grey = (apart - apart.mean(1, keepdim=True)).norm(dim=1) > _GREYER  # beside fair skin grey hair is hardly darker
+    unlike = (apart.norm(dim=1) > _UNLIKE_SKIN) | grey
     graph = VertexGraph(faces, len(colors))
     hair = (forehead & unlike).double()
     for _ in range(_HAIR_EDGE):
