@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.errors import AlignmentError
+from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import Similarity
 from torchface.synthetic import performer
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
@@ -80,6 +81,24 @@ def check_exchanged(capture: Capture, pair: tuple[int, int], share: float, which
     assert mesh_error(rig, found, true) < 1.1 * clean_error(capture, which, frames)
     assert found.alignment.scale == 1.0
     assert found.warnings == ()
+
+
+@pytest.mark.parametrize(("turn", "way"), [(0.9, 60.0), (0.12, 200.0)])
+def test_a_head_that_moves_freely_in_the_volume_costs_nothing(stage: Capture, turn: float, way: float) -> None:
+    rig, sites, _ = stage
+    take, true = recorded(stage, frames=60)
+    assert take.markers is not None
+    values = take.markers.values
+    phase = torch.linspace(0, 6.28, len(values))
+    turned = rotation_matrix(turn * torch.stack([0.3 * phase.sin(), phase.cos(), 0 * phase], 1))
+    middle = values.nanmean((0, 1))
+    moved = (values - middle) @ turned.transpose(1, 2) + middle
+    moved = moved + way * torch.stack([phase.sin(), 0 * phase, (2 * phase).cos()], 1)[:, None]
+    freely = replace(take, markers=Track(take.markers.names, moved))
+    found = solve_markers(rig, sites, freely, AS_IN_THE_HOW_TO)
+    assert mesh_error(rig, found, true) < 1.1 * clean_error(stage, 0, 60)
+    with pytest.raises(AlignmentError, match=r"or of the head in the volume, .* add --slip"):
+        solve_markers(rig, sites, freely, replace(AS_IN_THE_HOW_TO, slip=False))
 
 
 @pytest.mark.parametrize(

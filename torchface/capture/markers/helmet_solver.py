@@ -11,7 +11,7 @@ from torchface.capture.energy import Quadratic, chunks_of_frames, marker_term
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver, frames_seen, markers_of
 from torchface.errors import ShapeError
 from torchface.geometry.rotations import rotation_matrix, rotation_vector
-from torchface.geometry.similarity import Similarity
+from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.optim import BoxQP, box_qp
 from torchface.optim.box_checks import default_tolerance
 from torchface.optim.data_dependent import data_dependent
@@ -24,6 +24,7 @@ _ARM = 30.0
 # mm² a marker for a squared millimetre of slip: counts only where markers are too few to determine a motion.
 _MOTION_RIDGE = 1e-4
 _MAX_ITERATIONS, _MOTION_TOLERANCE = 6, 1e-4
+_ENOUGH = 6  # markers from which a motion is known beside the expression's
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +57,17 @@ class HelmetMotion:
         return (markers - (self.pivot + self.translation)[:, None].to(markers)) @ self.rotation.to(
             markers
         ) + self.pivot.to(markers)
+
+    def after(self, first: "HelmetMotion") -> "HelmetMotion":
+        """This motion of what has moved by another, about the same pivot."""
+        turned = (self.rotation @ first.translation[..., None])[..., 0]
+        return HelmetMotion(self.rotation @ first.rotation, turned + self.translation, self.pivot)
+
+    @staticmethod
+    def none(seen: Tensor, pivot: Tensor) -> "HelmetMotion":
+        """No motion in as many frames as ``seen`` (T,M,3) has."""
+        still = torch.eye(3, dtype=seen.dtype, device=seen.device).repeat(len(seen), 1, 1)
+        return HelmetMotion(still, seen.new_zeros(len(seen), 3), pivot)
 
     def degrees(self) -> Tensor:
         """The rotation vectors, (T,3), degrees."""
@@ -179,8 +191,8 @@ class HelmetSolver(nn.Module):
         penalty[:shapes] = self.markers.sparsity
         ridge = rest.new_full((shapes + 6,), 2 * _MOTION_RIDGE)
         ridge[:shapes] = 2 * self.markers.ridge
-        rotation = torch.eye(3, dtype=rest.dtype, device=rest.device).expand(len(seen), 3, 3)
-        translation = rest.new_zeros(len(seen), 3)
+        start = rough_motion(seen.detach(), rest)[0] if self.exact else HelmetMotion.none(seen, pivot)
+        rotation, translation = start.rotation, start.translation
         solution: Tensor | None = None
         shared: BoxQP | None = None
         # Correctives join after a first solve without them.
@@ -209,6 +221,21 @@ class HelmetSolver(nn.Module):
 
     def extra_repr(self) -> str:
         return f"exact={self.exact}"
+
+
+def rough_motion(seen: Tensor, rest: Tensor) -> tuple[HelmetMotion, Tensor]:
+    """How a frame's markers (T,M,3) lie beside their sites at rest (M,3) as a whole, and the frames (K,) that show it.
+
+    The others have no motion: they show too few markers.
+    """
+    pivot = rest.mean(0)
+    found = HelmetMotion.none(seen, pivot)
+    rows = ((~torch.isnan(seen).any(-1)).sum(1) >= _ENOUGH).nonzero()[:, 0]
+    if len(rows):
+        placed = similarity_transform(rest.expand_as(seen[rows]), seen[rows], scale=False)
+        found.rotation[rows] = placed.rotation
+        found.translation[rows] = placed.rotation @ pivot + placed.translation - pivot
+    return found, rows
 
 
 def rigid_columns(rest: Tensor, pivot: Tensor) -> Tensor:

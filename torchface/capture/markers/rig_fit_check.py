@@ -93,7 +93,7 @@ class FitCheck:
         return unit_of_scale(float(self.similarity.scale[0]), self.read_as) or "mm"
 
 
-def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
+def check_fit(affine: Tensor, markers: Tensor, slip: bool = False, aligned: bool = False) -> FitCheck:
     """Solves some frames of a take for weights, and where markers stay far from the rig looks for the cause.
 
     Weights are solved with hardly a penalty, so that the distance is what the rig cannot explain. Where its median
@@ -106,6 +106,7 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
         affine: of each marker's site in the weights, (M,3,N+1), mm: at rest, then each shape's delta.
         markers: (T,M,3), in rig space as far as is known, NaN for not seen.
         slip: the helmet's motion will be taken out: it is not part of the distance.
+        aligned: the take has been aligned with the rig: what is left of a rigid motion is the head's, however large.
 
     Returns:
         A ``FitCheck``.
@@ -139,14 +140,17 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
         return replace(found, cause="mirror", corrected=_distance(affine, pose.apply(flipped)))
     pose = pose_of_take(affine, few)
     laid = pose.apply(few)
-    if slip and not _is_elsewhere(pose, few, radius):
-        return _with_slip(affine, few, found)
+    near = not _is_elsewhere(pose, few, radius)
+    if slip and (near or aligned):
+        steady = _with_slip(affine, few, found)
+        if near or not steady.refused:
+            return steady
     found = replace(found, similarity=pose)
     corrected = _distance(affine, laid)
-    if replace(found, distance=corrected).noisy and not _is_elsewhere(pose, few, radius):
-        steady = _distance(affine, _without_motion(affine, laid))
-        if steady < _CORRECTED * corrected:
-            return replace(found, cause="slip", corrected=steady)
+    if replace(found, distance=corrected).noisy and (near or aligned) and not slip:
+        moved = _distance(affine, _without_motion(affine, few if aligned else laid))
+        if moved < _CORRECTED * corrected:
+            return replace(found, cause="slip", corrected=moved)
     if corrected < _CORRECTED * distance and corrected <= found.limit:
         cause = "unit" if unit_of_scale(float(pose.scale[0])) else "alignment"
         return replace(found, cause=cause, corrected=corrected)

@@ -18,12 +18,14 @@ from torchface.capture import (
     rest_residual,
 )
 from torchface.capture.markers import Cleanup, FitCheck, HelmetMotion
+from torchface.capture.markers.helmet_solver import rough_motion
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY
 from torchface.evaluation.mesh_errors import marker_offsets
 from torchface.geometry.similarity import Similarity
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, empty_frames
+from torchface.temporal import nearest_rows
 from torchface.workflows.marker_input import scale_warnings
 from torchface.workflows.solve.head_camera import Predicted
 from torchface.workflows.solve.take_check import (
@@ -38,6 +40,7 @@ from torchface.workflows.solve.weight_stream import StreamReport
 
 # A take is cleaned again where its alignment moves a site farther after the first cleaning, mm.
 _REALIGNED = 0.1
+_SLIPS = 0.3  # of the sites' mean distance from their centre: farther no helmet slips
 _MOST = 0.8  # of the samples, below which a take shows too little
 _STRAY = 8.0  # times the median distance: noise stays below it, spikes and exchanged labels do not
 _SHOWN_SPANS = 6
@@ -206,6 +209,9 @@ def solve_markers(
     solver = MarkerSolver(rig, attachment, sparsity=settings.sparsity, ridge=settings.ridge)
     fit = check_explained(solver, take, alignment is not None, settings.slip, settings.insist)
     warnings += fit_warnings(fit, alignment is not None)
+    rough = _rough_motion(solver, take) if settings.slip else None
+    if rough is not None:
+        take = _moved(take, rough.undo)
     warnings += _empty_frame_warnings(take)
     if settings.neutral is not None:
         warnings += neutral_warnings(rig, attachment, raw, settings.neutral, settings.free_scale)
@@ -216,7 +222,7 @@ def solve_markers(
     else:
         progress("looking for what is wrong with the take")
         cleanup = clean_take(solver, take, settings.slip)
-        if alignment is not None and any(defect.kind != "gap" for defect in cleanup.defects):
+        if alignment is not None and rough is None and any(defect.kind != "gap" for defect in cleanup.defects):
             # What was wrong with the take moved its alignment, and the alignment its cleaning.
             repaired = _moved(cleanup.take, alignment.inverse().apply)
             better = align_take(rig, attachment, repaired, settings.neutral, settings.insist, settings.free_scale)
@@ -248,6 +254,8 @@ def solve_markers(
     if cleanup is not None and cleanup.take.markers is not None:  # what was filled in was not seen
         markers = torch.where(torch.isnan(cleanup.take.markers.select(labels).values), torch.nan, markers)
     sites = attachment.select(labels)
+    if rough is not None and motion is not None:
+        motion = rough.after(motion)
     solution = Solution(rig, solved, markers, sites, alignment, motion, cleanup)
     return replace(solution, warnings=(*warnings, *solution.stray_warnings))
 
@@ -257,6 +265,22 @@ def _moved(take: Take, move: Callable[[Tensor], Tensor]) -> Take:
     assert take.markers is not None
     values = take.markers.values
     return replace(take, markers=Track(take.markers.names, move(values.double()).to(values)))
+
+
+def _rough_motion(solver: MarkerSolver, take: Take) -> HelmetMotion | None:
+    """How each frame's markers lie as a whole, where a head moves freely in a volume; None where a helmet slips, whose
+    motion is solved for with the weights."""
+    assert take.markers is not None
+    rest = solver.rest.double()
+    found, rows = rough_motion(solver.arrange(take.markers).double(), rest)
+    if not len(rows):
+        return None
+    radius = float((rest - found.pivot).norm(dim=1).mean())
+    moved = (found.apply(rest.expand(len(take), -1, -1)) - rest)[rows].norm(dim=-1).mean(1)
+    if float(moved.max()) < _SLIPS * radius:
+        return None
+    nearest = rows[nearest_rows(rows, len(take))]
+    return HelmetMotion(found.rotation[nearest], found.translation[nearest], found.pivot)
 
 
 def _without_slip(

@@ -91,7 +91,7 @@ def check_explained(solver: MarkerSolver, take: Take, aligned: bool, slip: bool,
     refused."""
     assert take.markers is not None
     markers = solver.arrange(take.markers).double()
-    fit = check_fit(torch.cat([solver.rest[..., None], solver.every_basis], dim=2), markers, slip)
+    fit = check_fit(torch.cat([solver.rest[..., None], solver.every_basis], dim=2), markers, slip, aligned)
     fit = replace(fit, read_as=take.extras.get("unit"))
     if fit.refused and not insist:
         raise AlignmentError(
@@ -228,7 +228,10 @@ def _cause(fit: FitCheck, aligned: bool) -> str:
             "rig's space), or the labels of left and right are swapped (--labels)"
         )
     if fit.cause == "slip":
-        return f"without the motion of the helmet against the head {fit.corrected:.2g} mm are left: add --slip"
+        return (
+            f"without the motion of the helmet against the head, or of the head in the volume, {fit.corrected:.2g} mm "
+            "are left: add --slip"
+        )
     tried = (
         "the take is aligned with the rig" if aligned else "turning, moving and scaling the take does not help enough"
     )
