@@ -31,6 +31,9 @@ _COUNTING = 0.2  # of a new count of people that is taken up at once
 _LASTING = 0.6  # seconds for which it is known where the other is
 _ALIKE, _UNLIKE = 0.8, 1.5  # correlation of looks from which a face counts as the same, and what lacks counts in sides
 _STRANGE = 0.4  # correlation under which a face is not that of one who is hidden
+_SAME = 0.9  # from which it is, where that one was, if the other is seen elsewhere
+_ELSEWHERE = 0.5  # of a smoothed count of others
+_AROUND = 1.0  # sides: what is half hidden by the other, and so looks like nobody, lies within
 _RESEMBLING = 0.5  # what the logarithm of two sides counts in sides
 _SURE, _CLEARLY = 0.12, 2.0  # sides: nearer is the followed one; how much nearer than the other one that was hidden is
 
@@ -101,8 +104,11 @@ def is_other(identity: Tensor, place: Tensor, look: Tensor, interval: Tensor) ->
     hidden = own[5] > 1.5 * interval
     nearer = from_other < from_own * torch.where(hidden, _CLEARLY, 1.0)
     nearer = nearer & ((other[5] > 0.5 * interval) | (from_other < _BESIDE))  # else the other is seen beside this face
-    nearer = nearer | (hidden & (likeness < _STRANGE))
-    return _is_known(identity) & nearer & (from_own > torch.where(hidden, 0.0, _SURE)) & (own[5] < _FORGOTTEN)
+    same = (likeness >= _SAME) & (_apart(own, place[:2]) < _BESIDE)
+    nearer = nearer & ~(hidden & same & (counted_beside(identity).sum() > _ELSEWHERE))
+    theirs = _is_known(identity) & nearer
+    theirs = theirs | ((own[2] > 0) & hidden & (likeness < _STRANGE))  # somebody who was not noticed before
+    return theirs & (from_own > torch.where(hidden, 0.0, _SURE)) & (own[5] < _FORGOTTEN)
 
 
 def after_face(identity: Tensor, place: Tensor, look: Tensor, whose: tuple[Tensor, Tensor], interval: Tensor) -> Tensor:
@@ -122,8 +128,10 @@ def after_face(identity: Tensor, place: Tensor, look: Tensor, whose: tuple[Tenso
     followed = torch.cat([moved, other, counted_beside(identity), mixed])
     # Of two boxes that overlap the wrong one may have been taken for the other's.
     mistaken = (other[5] <= 0) & (_likeness(identity, look) < _STRANGE)
+    mistaken = mistaken & ((other[2] <= 0) | (_apart(other, place[:2]) < _AROUND))
+    reached = (other[5] > 0) & (_distance(other, place, 1) < _REACH + _QUICK * other[5])
     passing = torch.cat([own, _moved(torch.where(mistaken, 0.0, other), place[:3], interval), identity[2 * _MOTION :]])
-    return torch.where(seen, followed, torch.where(stranger & ((other[5] > 0) | mistaken), passing, identity))
+    return torch.where(seen, followed, torch.where(stranger & (reached | mistaken), passing, identity))
 
 
 def counted_beside(identity: Tensor) -> Tensor:
