@@ -7,10 +7,10 @@ import torch
 from torchface.errors import AlignmentError
 from torchface.geometry.meshes.operators import edges
 from torchface.geometry.meshes.unit_check import check_unit, extent
-from torchface.geometry.mirrored_points import check_mirrored
 from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh
 from torchface.registration.nonrigid.registration_record import RegistrationRecord
+from torchface.registration.scan_preparation import check_same_hand
 from torchface.registration.scan_registration import Registration
 
 _LEAST_EXTENT, _MOST_EXTENT = 0.2, 5.0  # of the source's: characters differ by less, units by more
@@ -45,12 +45,7 @@ def check_own_topology(source: Mesh, target: Mesh, name: str = "neutral") -> Non
     if size == 0 or beside == 0:
         return  # the solve says it
     check_unit(name, goal, beside, "the template", _LEAST_EXTENT, _MOST_EXTENT)
-    mirrored = check_mirrored(rest, goal)
-    if mirrored.mirrored:
-        raise AlignmentError(
-            f"{name}: found a mirror image of the template, inside out: {mirrored.figures()} are left; it was "
-            "exported in left-handed axes: export it in right-handed ones, or negate one coordinate of its vertices"
-        )
+    check_same_hand(rest, goal, name)
     ends = edges(source.faces.cpu())
     lengths = [(m.vertices.detach().cpu().double()[ends]).diff(dim=1).norm(dim=-1) for m in (source, target)]
     solid = lengths[0] > 0

@@ -106,13 +106,13 @@ def _inside_out(scan: PreparedScan) -> bool:
 
 
 def check_same_hand(own: Tensor, points: Tensor, name: str = "landmarks") -> None:
-    """Raises ``AlignmentError`` where points on a scan (L,3) are a mirror image of a template's own (L,3)."""
+    """Raises ``AlignmentError`` where points on a scan, or its vertices, (L,3), are a mirror image of a template's."""
     mirrored = check_mirrored(own, points)
     if mirrored.mirrored:
         raise AlignmentError(
-            f"{name}: those on the scan are a mirror image of the template's: {mirrored.figures()} are left; the scan "
-            "was exported in left-handed axes (export it in right-handed ones, or negate one coordinate of its "
-            "vertices and landmarks), or those of left and right are swapped"
+            f"{name}: found a mirror image of the template's: {mirrored.figures()} are left; the scan was exported in "
+            "left-handed axes (export it in right-handed ones, or negate one coordinate of its vertices and "
+            "landmarks), or left and right are swapped"
         )
 
 
