@@ -56,6 +56,23 @@ def test_a_profile_of_light_with_two_primaries_swapped(ending: str, colors: np.n
     torch.testing.assert_close(decode_image(path.read_bytes(), "texture").double(), stored, atol=1e-6, rtol=0)
 
 
+@pytest.mark.parametrize("first", ["none", "sRGB"])
+@pytest.mark.parametrize("where", ["behind", "thumbnail"])
+def test_a_second_picture_in_a_jpeg_gives_it_no_profile(first: str, where: str, tmp_path: Path) -> None:
+    red, green, blue = PRIMARIES
+    flat = Image.new("RGB", (16, 16), (200, 90, 30))
+    own = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes() if first == "sRGB" else None
+    flat.save(tmp_path / "image.jpg", icc_profile=own)
+    flat.save(tmp_path / "other.jpg", icc_profile=profile((blue, green, red), 2.2))
+    alone, swapped = load_image(tmp_path / "image.jpg"), load_image(tmp_path / "other.jpg")
+    torch.testing.assert_close(swapped, alone[[2, 1, 0]], atol=0.03, rtol=0)
+    data, other = (tmp_path / "image.jpg").read_bytes(), (tmp_path / "other.jpg").read_bytes()
+    segment = b"\xff\xff\xe1" + struct.pack(">H", 2 + len(other)) + other  # an 0xFF more may stand before a marker
+    both = data + other if where == "behind" else data[:2] + segment + data[2:]
+    (tmp_path / "image.jpg").write_bytes(both)
+    assert torch.equal(load_image(tmp_path / "image.jpg"), alone)
+
+
 def test_what_says_that_it_is_srgb_is_not_changed(colors: np.ndarray, tmp_path: Path) -> None:
     own = ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
     Image.fromarray(colors).save(tmp_path / "image.png", icc_profile=own)

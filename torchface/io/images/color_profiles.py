@@ -19,7 +19,8 @@ from torchface.io.images.tiff_tags import ICC_PROFILE, tag_bytes
 _MOST_BYTES = 2**23  # of a profile; those of printers have some megabytes
 _OF_SRGB, _LIKE_SRGB = 1 / 2.2, 0.05  # what a PNG of sRGB says, and how much otherwise makes no difference
 _SAME = 2  # of 255: by how much profiles of sRGB differ
-_JPEG_PROFILE = re.compile(rb"\xff\xe2(..)ICC_PROFILE\0(.).", re.DOTALL)
+_JPEG_PROFILE = re.compile(rb"ICC_PROFILE\0(.).", re.DOTALL)
+_JPEG_PICTURE = (0xD9, 0xDA)  # markers of its end and of its pixels, which no profile follows
 _LEVELS = np.linspace(0, 255, 6).round().astype(np.uint8)
 _ROWS = 256
 
@@ -78,16 +79,23 @@ def _embedded(data: bytes, source: str) -> tuple[bytes, float]:
     if data.startswith(b"\x89PNG"):
         return _of_png(data)
     if data.startswith(b"\xff\xd8"):
-        parts = {
-            match[2]: data[match.end() : match.start() + 2 + int.from_bytes(match[1], "big")]
-            for match in _JPEG_PROFILE.finditer(data)
-        }
-        return b"".join(parts[number] for number in sorted(parts)), 0.0
+        return _of_jpeg(data), 0.0
     if data[:4] == b"RIFF" and data[30:34] == b"ICCP":
         return data[38 : 38 + int.from_bytes(data[34:38], "little")], 0.0
     if data[:2] in (b"II", b"MM"):
         return tag_bytes(data, source, ICC_PROFILE), 0.0
     return b"", 0.0
+
+
+def _of_jpeg(data: bytes) -> bytes:
+    at, parts = 2, dict[bytes, bytes]()
+    # Segments have to be walked: a thumbnail in one of them, and a second picture behind the first, have profiles too.
+    while at + 4 <= len(data) and data[at] == 0xFF and (kind := data[at + 1]) not in _JPEG_PICTURE:
+        end = at + 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+        if kind == 0xE2 and (match := _JPEG_PROFILE.match(data, at + 4, end)):
+            parts[match[1]] = data[match.end() : end]
+        at = at + 1 if kind == 0xFF else end
+    return b"".join(parts[number] for number in sorted(parts))
 
 
 def _of_png(data: bytes) -> tuple[bytes, float]:
