@@ -8,7 +8,7 @@ import torch
 from mutation import check_reader
 from safetensors.torch import load_file, save_file
 
-from torchface.errors import FileFormatError, ShapeError, TopologyError
+from torchface.errors import FileFormatError, ShapeError, TopologyError, ValueRangeError
 from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
 
 FACES = torch.tensor([[0, 1, 2], [2, 3, 0]])
@@ -115,6 +115,13 @@ def test_other_meshes_are_refused(tmp_path: Path) -> None:
             writer.append(torch.zeros(5, 3))
         with pytest.raises(ShapeError, match="more than the 2"):
             writer.append(MESHES)
+
+
+@pytest.mark.parametrize("fps", [float("nan"), 0.0, -3.0])
+def test_what_is_no_rate_is_refused_before_anything_is_written(fps: float, tmp_path: Path) -> None:
+    with pytest.raises(ValueRangeError, match=r"mesh sequence: found .* frames a second"):
+        MeshSequenceWriter(tmp_path / "heads.safetensors", 2, 4, FACES, fps=fps)
+    assert not list(tmp_path.iterdir())
 
 
 def test_other_files_are_named(tmp_path: Path) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from torch import Tensor
 
-from torchface.errors import FileFormatError, ShapeError, TopologyError
+from torchface.errors import FileFormatError, ShapeError, TopologyError, ValueRangeError
 from torchface.files.documents import read_json, write_json
 from torchface.files.temporary_files import open_plain
 from torchface.files.whole_files import sync_folder
@@ -127,6 +127,7 @@ class MeshSequenceWriter:
 
     Raises:
         FileFormatError: the file cannot be written.
+        ValueRangeError: ``fps`` is no rate.
 
     Example:
         >>> writer = MeshSequenceWriter("take.safetensors", count=2, vertices=3, faces=torch.tensor([[0, 1, 2]]))
@@ -152,7 +153,7 @@ class MeshSequenceWriter:
         self._note = self.path.with_name(f"{self.path.name}.part.json")
         numbers = faces.detach().cpu().contiguous().numpy().astype("<i8").tobytes()
         size = 4 * count * vertices * channels
-        rate = {} if fps is None else {"fps": repr(float(fps))}
+        rate = {} if fps is None else {"fps": repr(check_rate(fps, "mesh sequence", ValueRangeError))}
         header = json.dumps(
             {
                 "__metadata__": {"format": FORMAT, "key": key, **rate, "content": _UNKNOWN},
