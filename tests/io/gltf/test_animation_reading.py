@@ -133,6 +133,17 @@ def test_steps_hold_until_the_next_key(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found.weights.values[..., 0], expected)
 
 
+@pytest.mark.parametrize("way", ["CUBICSPLINE", "STEP"])
+def test_of_keys_in_one_frame_at_the_end_the_last_counts(way: str, tmp_path: Path) -> None:
+    keys = np.random.default_rng(0).uniform(0, 1, (3, 3, len(sheet_rig().names))).astype(np.float32)
+    keys = keys if way == "CUBICSPLINE" else keys[:, 1]
+    found = read_gltf_weights(keyed(tmp_path / "take.glb", way, torch.tensor([0.0, 1.0, 1.0001]), keys))
+    assert (found.fps, len(found)) == (30.0, 31)
+    assert bool(found.weights.values.isfinite().all())
+    last = keys[2, 1] if way == "CUBICSPLINE" else keys[2]
+    np.testing.assert_allclose(found.weights.values[-1, :, 0], last, atol=1e-6)
+
+
 def test_a_rig_at_rest_plays_nothing(tmp_path: Path) -> None:
     save_rig(sheet_rig(), tmp_path / "rig.glb")
     assert read_gltf_weights(tmp_path / "rig.glb") is None

@@ -36,7 +36,9 @@ class _Curves:
         """Values (F,N) at times (F,) between keys at (T,). Source: glTF 2.0, appendix C."""
         first = np.clip(np.searchsorted(times, wanted, "right") - 1, 0, len(times) - 2)
         step = (times[first + 1] - times[first])[:, None].astype(np.float32)
-        t = np.clip((wanted - times[first])[:, None] / step, 0, 1).astype(np.float32)
+        past = (wanted - times[first])[:, None]
+        t = np.divide(past, step, out=np.ones_like(past), where=step > 0)  # the last two keys may be of one frame
+        t = np.clip(t, 0, 1).astype(np.float32)
         (_, start, leaving), (arriving, end, _) = self.keys[first].swapaxes(0, 1), self.keys[first + 1].swapaxes(0, 1)
         if self.way == _STEP:
             return np.where(t < 1, start, end)
@@ -50,7 +52,8 @@ def read_gltf_weights(path: str | Path) -> Take | None:
     """The weights that a file's animations give its shapes; none where nothing moves shapes.
 
     Keys are frames. Where they are further apart than a film's and not joined by straight lines, their steps and
-    cubic splines are sampled at 30, 24, 25 or 60 frames a second, the first of them whose frames meet all keys.
+    cubic splines are sampled at 30, 24, 25 or 60 frames a second, the first of them whose frames meet all keys. Where
+    no rate's frames do, they are sampled at 60, and the extremes at keys between two frames are not kept.
 
     Each mesh has the weights of the first animation that moves it: some programs write one animation of several objects
     as several, others write several takes of the same face. A ``UserWarning`` reports what is left out.
