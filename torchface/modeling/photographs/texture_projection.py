@@ -265,9 +265,8 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
         seen_color = torch.lerp(mean, graph.smoothed(seen_color, typical, _BROAD), weight / (weight + _SPARSE))
     under = torch.where(fixed, seen_color, mean)
     lost = (_HEAT_LOSS_AT_MASK if masked else _HEAT_LOSS) / graph.finer
-    for _ in range(
-        0 if bool(fixed.all()) else graph.rounds(_FILL)
-    ):  # heat that flows from what is covered; behind a mask it is lost
+    # Heat flows from what is covered; behind a mask it is lost.
+    for _ in range(0 if bool(fixed.all()) else graph.rounds(_FILL)):
         under = torch.where(fixed, under, torch.lerp(graph.sum(under) / graph.degree[:, None], mean, lost))
     return guess + (1 - covered)[:, None] * under
 

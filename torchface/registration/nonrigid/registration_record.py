@@ -26,9 +26,8 @@ class StageRecord:
 class RegistrationRecord:
     """A whole registration."""
 
-    start: (
-        str  # how the template came to lie on the scan: "landmarks", "detected landmarks", "shape" or "its triangles"
-    )
+    # how the template came to lie on the scan: "landmarks", "detected landmarks", "shape" or "its triangles"
+    start: str
     start_distance: float  # median distance from template to scan after that, millimetres
     stages: tuple[StageRecord, ...]  # in order
     notes: tuple[str, ...]  # what was found in the input and what was done about it, for people to read

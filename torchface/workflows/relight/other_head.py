@@ -27,11 +27,8 @@ from torchface.workflows.track.upright_rig import upright
 
 # In distances between the eyes' outer corners; of colours' logarithms; rings of vertices; share; vertices; of white.
 _ABOVE_BROWS, _UNLIKE_SKIN, _HAIR_EDGE, _HALF_HAIR, _FEWEST, _DARK = 0.08, 0.5, 3, 0.2, 20, 0.02
-_GREYER, _BACK, _TEMPLES = (
-    0.2,
-    (0.35, -0.7),
-    (-0.45, -0.2),
-)  # logarithms of hue; behind the ears' landmarks; and over the eyes
+# Logarithms of hue; behind the ears' landmarks; and over the eyes.
+_GREYER, _BACK, _TEMPLES = 0.2, (0.35, -0.7), (-0.45, -0.2)
 
 
 def other_head(path: Path) -> BlendshapeRig:

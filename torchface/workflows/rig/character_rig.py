@@ -177,9 +177,8 @@ def check_character(path: Path) -> None:
             check_there(path)
         bare = f"a mesh alone gets them by: torchface arkit {path} --out {path.stem}.glb"
         converted = bare if ending in MESH_ENDINGS else "export it as .glb"
-        how = _CONVERT.get(ending, converted).format(
-            path=path, stem=path.stem
-        )  # here: the input's folder may be closed
+        # The output is named without the input's folder, which may be closed.
+        how = _CONVERT.get(ending, converted).format(path=path, stem=path.stem)
         raise FileFormatError(
             f"{path}: found {ending!r}, expected a character's .glb, .vrm or USD ({how}), or --template for a scan"
         )
