@@ -28,6 +28,7 @@ _METHOD = "enhance: correspondence/2"
 _NEAR, _NEAR_BY_PAIRS = 2.0, 6.0
 _SMALLEST, _LARGEST = 0.12, 5.8  # of the model's extent: a whole person beside a face, or a face beside a whole person
 _MOST_POINTS = 5000
+_FEWEST_LANDMARKS = 3
 _ALIKE = 0.5  # cosine between two surfaces that are to be one
 _COLUMNS = ("input", "model")
 
@@ -106,16 +107,20 @@ def find_correspondence(
         residual = float((pose.apply(vertices[None])[0] - target).square().sum(-1).mean().sqrt())
         return HeadCorrespondence(pose, model.vertices, torch.ones(len(vertices), dtype=torch.bool), residual)
     given = None if pairs is None else load_pairs(pairs, head, model)
-    key = content_key(
-        _METHOD, head=head.vertices, faces=head.faces, model=model.vertices, triangles=model.faces, given=given
-    )
-    parts, face = read_checkpoint(state, key), _face(head)
+    meshes = [[mesh.vertices, mesh.faces, _landmarks(mesh)] for mesh in (head, model)]
+    face = _face(head)
+    key = content_key(_METHOD, meshes=meshes, face=face, given=given)
+    parts = read_checkpoint(state, key)
     if parts is None:
         size, expected = extent(head.vertices), extent(model.vertices)
         if not _SMALLEST < size / max(expected, 1e-9) < _LARGEST:
             raise ValueRangeError(
                 f"{path}: its head measures {size:.0f} mm from corner to corner, the model's {expected:.0f} mm; scale "
                 "it to the size of a head, in Blender for example"
+            )
+        if given is None and not bool(face[head.faces].all(1).any()):
+            raise ValueRangeError(
+                f"{path}: found no triangle in its region face, expected those of the face, or no such region"
             )
         bent, pose, known = (
             _by_registration(head, face, model, progress) if given is None else _by_pairs(head, model, *given)
@@ -187,12 +192,19 @@ def _face(head: Mesh) -> Tensor:
     return regions.get("face", torch.ones(len(head.vertices), dtype=torch.bool))
 
 
+def _landmarks(mesh: Mesh) -> Tensor | None:
+    return None if mesh.annotations is None else mesh.annotations.landmarks
+
+
 def _by_registration(head: Mesh, face: Tensor, model: Mesh, progress: Progress) -> tuple[Tensor, Similarity, Tensor]:
     """The sparse head's face is bent onto the dense one: that takes seconds, the other way round minutes."""
     part, landmarks = submesh(head, face), None
-    marks = [None if mesh.annotations is None else mesh.annotations.landmarks for mesh in (part.mesh, model)]
-    if marks[0] is not None and marks[1] is not None and len(marks[0]) == len(marks[1]):
-        landmarks = marks[0], model.vertices[marks[1]].double()
+    marks, sites = _landmarks(head), _landmarks(model)
+    if marks is not None and sites is not None and len(marks) == len(sites):
+        rows, points = face.cumsum(0) - 1, model.vertices[sites].double()
+        points[~face[marks]] = torch.nan  # not on the part that is registered
+        if int(face[marks].sum()) >= _FEWEST_LANDMARKS:
+            landmarks = rows[marks].clamp(min=0), points
 
     def report(step: str, done: int = 0, total: int = 0) -> None:
         progress("aligning the input with the model", done, total)
