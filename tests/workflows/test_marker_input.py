@@ -126,6 +126,13 @@ def test_a_map_with_and_without_a_heading(tmp_path: Path) -> None:
         assert load_label_map(path) == {"LBrowIn": "M001", "a, b": "M002", "helmet": ""}
 
 
+def test_a_map_as_excel_writes_it(tmp_path: Path) -> None:
+    path, text = tmp_path / "map.csv", 'LBrowIn;M001\n"a, b";M002\nhelmet;\n'
+    for data in (text.encode(), text.encode("utf-16"), f"sep=;\ntake;attachment\n{text}".encode()):
+        path.write_bytes(data)
+        assert load_label_map(path) == {"LBrowIn": "M001", "a, b": "M002", "helmet": ""}
+
+
 @pytest.mark.parametrize(
     ("text", "said"),
     [

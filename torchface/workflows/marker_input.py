@@ -1,7 +1,5 @@
 """A marker take from disk: in millimetres, by an attachment's labels, cut to some frames."""
 
-import csv
-import io
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -15,11 +13,10 @@ from torchface.attachment import Attachment
 from torchface.capture.markers import match_labels, own_labels
 from torchface.capture.markers.rig_fit_check import unit_of_scale
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.files.whole_files import read_file
 from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE
 from torchface.io import load_take
 from torchface.io.markers.marker_csv import is_marker_header
-from torchface.io.tables.csv_table import TableReader, quoted
+from torchface.io.tables.csv_table import CellRows, TableReader, quoted
 from torchface.io.take_files import MARKER_ENDINGS
 from torchface.take import Take, Track
 from torchface.workflows.batch.batch_items import ItemKind
@@ -153,25 +150,22 @@ def load_label_map(path: str | Path) -> dict[str, str]:
         helmet_front,
         Jane:*,
 
-    The heading may be left out; an empty second cell leaves the marker out, or all markers of a subject.
+    Semicolons may stand for commas, and the heading may be left out; an empty second cell leaves the marker out, or all
+    markers of a subject.
     """
-    path = Path(path)
-    try:
-        rows = list(csv.reader(io.StringIO(read_file(path, _MAX_BYTES).decode("utf-8-sig"), newline="")))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise FileFormatError(f"{path}: no table of labels ({error}), expected rows of take,attachment") from error
     renamed: dict[str, str] = {}
-    for number, row in enumerate(rows, 1):
+    rows = CellRows(path, _MAX_BYTES)
+    for index, row in enumerate(rows):
         cells = [cell.strip() for cell in row]
-        if not any(cells) or (number == 1 and tuple(cell.lower() for cell in cells) == HEADER):
+        if not any(cells) or (index == 0 and tuple(cell.lower() for cell in cells) == HEADER):
             continue
         if len(cells) != 2 or not cells[0]:
             raise FileFormatError(
-                f"{path}: row {number}: found {quoted(cells)}, expected two cells: a label of the take, and the "
+                f"{path}: row {rows.number}: found {quoted(cells)}, expected two cells: a label of the take, and the "
                 "attachment's"
             )
         if cells[0] in renamed:
-            raise FileFormatError(f"{path}: row {number}: found {cells[0]!r} again, expected each label once")
+            raise FileFormatError(f"{path}: row {rows.number}: found {cells[0]!r} again, expected each label once")
         renamed[cells[0]] = cells[1]
     if not renamed:
         raise FileFormatError(f"{path}: found no row, expected a label of the take and of the attachment in each")

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from torchface import Take, Track, load_take, save_take
+from torchface.errors import FileFormatError
 from torchface.io.tables.csv_table import TableReader, write_table
 
 NAMES = ("=cmd|' /C calc'!A0", "@SUM(1)", "+x", "-y", "'=quoted", "''@twice", "'plain", "jawOpen")
@@ -47,16 +48,31 @@ def test_markers_named_so_come_back(name: str, tmp_path: Path) -> None:
     assert found.names == (name,)
 
 
-@pytest.mark.parametrize("kind", ["semicolons", "UTF-16", "trailing"])
+@pytest.mark.parametrize("kind", ["semicolons", "UTF-16", "trailing", "trailing spaces", "stated"])
 def test_tables_of_other_programs_are_read(kind: str, tmp_path: Path) -> None:
-    """Decimal commas between semicolons, UTF-16 as Windows writes it, a comma at the end of each row."""
+    """Decimal commas between semicolons, UTF-16 as Windows writes it, a comma at the end of each row, Excel's line."""
     text = "frame,time,jawOpen\n0,0.0,0.25\n1,0.04,-1.5e-1\n"
     changed = {
         "semicolons": text.replace(",", ";").replace(".", ",").encode(),
         "UTF-16": text.encode("utf-16"),
         "trailing": text.replace("\n", ",\r\n").encode(),
+        "trailing spaces": text.replace("\n", ", \n").encode(),
+        "stated": b"\xef\xbb\xbfsep=;\r\n" + text.replace(",", ";").replace(".", ",").encode(),
     }
     (tmp_path / "take.csv").write_bytes(changed[kind])
     table = TableReader(tmp_path / "take.csv").read()
     assert table.names == ("frame", "time", "jawOpen")
     assert table.numbers.tolist() == [[0, 0, 0.25], [1, 0.04, -0.15]]
+
+
+def test_a_quoted_comma_stands_in_its_cell(tmp_path: Path) -> None:
+    (tmp_path / "take.csv").write_text('frame;"jaw, open"\n0;0,5\n')
+    table = TableReader(tmp_path / "take.csv").read()
+    assert table.names == ("frame", "jaw, open")
+    assert table.numbers.tolist() == [[0, 0.5]]
+
+
+def test_rows_are_counted_with_excels_line(tmp_path: Path) -> None:
+    (tmp_path / "take.csv").write_text("sep=;\nframe;jawOpen\n0;shut\n")
+    with pytest.raises(FileFormatError, match="row 3, column 'jawOpen': found 'shut'"):
+        TableReader(tmp_path / "take.csv").read()

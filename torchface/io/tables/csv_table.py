@@ -23,6 +23,8 @@ _MAX_ROW = 2**22
 _MAX_NUMBER = float(np.finfo(np.float32).max)
 _SHARED_TEXT = 3  # letters; there are few texts so short, and a table may hold each a million times
 _BLOCK = 2**20
+_SEPARATOR = re.compile(r"sep=([,;\t])\s*", re.IGNORECASE)
+_QUOTED = re.compile(r'"[^"]*"')
 _FORMULA = re.compile(r"'*[=+\-@]")
 _RUN = ("=", "@", "'")  # a number may begin with a sign
 
@@ -52,20 +54,49 @@ class Table:
         return numbers
 
 
+class CellRows:
+    """The rows of a file, as they are asked for; ``number`` is that of the last one's line.
+
+    Commas stand between cells; or semicolons, as where numbers have decimal commas; or what Excel's line before the
+    first row, such as ``sep=;``, says.
+    """
+
+    def __init__(self, path: str | Path, most_bytes: int = MAX_TABLE_BYTES) -> None:
+        self._lines = TextLines(Path(path), read_file(path, most_bytes))
+        first, before = next(self._lines, ""), list[str]()
+        if stated := _SEPARATOR.fullmatch(first):
+            before, first = ["\n"], next(self._lines, "")
+        unquoted = _QUOTED.sub("", first)
+        self.separator = stated[1] if stated else ";" if ";" in unquoted and "," not in unquoted else ","
+        self._rows = csv.reader(chain(before, [first], self._lines), delimiter=self.separator)
+        if before:
+            next(self)
+
+    @property
+    def number(self) -> int:
+        return self._rows.line_num
+
+    def __iter__(self) -> Iterator[list[str]]:
+        return self
+
+    def __next__(self) -> list[str]:
+        self._lines.row_begins()
+        try:
+            return next(self._rows)
+        except csv.Error as error:
+            raise FileFormatError(f"{self._lines.path}: row {self.number}: {error}; expected a table") from error
+
+
 class TableReader:
     """A file whose first row, the header, is read, and whose other rows are read once their columns are known.
 
-    Commas stand between cells; or semicolons, as where numbers have decimal commas, which are read too. Rows may all
-    end in empty cells that have no name.
+    Decimal commas are read where no commas stand between cells. Rows may all end in empty cells that have no name.
     """
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
-        self._lines = TextLines(self.path, read_file(path, MAX_TABLE_BYTES))
-        first = next(self._lines, "")
-        self._semicolons = ";" in first and "," not in first
-        self._rows = csv.reader(chain([first], self._lines), delimiter=";" if self._semicolons else ",")
-        header = [_unescaped(cell.strip()) for cell in self._next() or ()]
+        self._rows = CellRows(path)
+        header = [_unescaped(cell.strip()) for cell in next(self._rows, ())]
         while header and not header[-1]:
             header.pop()
         self.header = tuple(header)
@@ -74,13 +105,6 @@ class TableReader:
         twice = [name for name, count in Counter(self.header).items() if count > 1]
         if twice:
             raise FileFormatError(f"{path}: found more than one column {quoted(twice)}, expected each once")
-
-    def _next(self) -> list[str] | None:
-        self._lines.row_begins()
-        try:
-            return next(self._rows, None)
-        except csv.Error as error:
-            raise FileFormatError(f"{self.path}: row {self._rows.line_num}: {error}; expected a table") from error
 
     def require(self, names: Iterable[str]) -> None:
         """Raises ``FileFormatError`` where the header lacks one of these columns."""
@@ -107,22 +131,22 @@ class TableReader:
         number_columns = [i for i, name in enumerate(self.header) if name in numeric]
         names = tuple(self.header[i] for i in number_columns)
         numbers, rows = array("d"), 0
-        while (cells := self._next()) is not None:
+        for cells in self._rows:
             if not cells:
                 continue
-            if len(cells) > width and not any(cells[width:]):
+            if len(cells) > width and not any(cell.strip() for cell in cells[width:]):
                 del cells[width:]
             if len(cells) < width and is_blank(cells):
                 cells += [""] * (width - len(cells))
             if len(cells) != width:
                 raise FileFormatError(
-                    f"{self.path}: row {self._rows.line_num}: found {len(cells)} cells, expected {width}"
+                    f"{self.path}: row {self._rows.number}: found {len(cells)} cells, expected {width}"
                 )
             for i in text_columns:
                 text = _unescaped(cells[i].strip())
                 text_cells[self.header[i]].append(text if len(text) > _SHARED_TEXT else shared.setdefault(text, text))
-            wanted = [cells[i].replace(",", ".") if self._semicolons else cells[i] for i in number_columns]
-            numbers.extend(parse_numbers(wanted, names, f"{self.path}: row {self._rows.line_num}"))
+            wanted = [cells[i] if self._rows.separator == "," else cells[i].replace(",", ".") for i in number_columns]
+            numbers.extend(parse_numbers(wanted, names, f"{self.path}: row {self._rows.number}"))
             rows += 1
         if rows == 0:
             raise FileFormatError(f"{self.path}: found a header and no rows, expected at least one frame")
