@@ -163,6 +163,29 @@ def test_sides_in_front_and_shared_by_all_stay() -> None:
     assert recognised_mapping(left, ["l_eyeBlink", "l_browDown"]).tolist() == [[1, 0], [0, 1]]
 
 
+@pytest.mark.parametrize(
+    ("ours", "theirs"),
+    [
+        (["eye_up", "eye_down"], ["brow_up", "brow_down"]),
+        (["eyes_left", "eyes_right"], ["head_left", "head_right"]),
+        (["upper_lip_suck", "upper_lip_tight"], ["lower_lip_suck", "lower_lip_tight"]),
+        (["blow_cheek", "suck_cheek"], ["blow_nose", "suck_nose"]),
+        (["eye_blink_left", "eye_wide_left", "eye_up"], ["brow_down_left", "brow_up"]),
+        (["Mouth_Smile_L", "Mouth_Chew"], ["Jaw_Open", "Jaw_Fwd", "Jaw_Chew"]),
+    ],
+)
+def test_a_beginning_or_ending_that_is_a_meaning_stays(ours: list[str], theirs: list[str]) -> None:
+    assert not bool(recognised_mapping(ours, theirs).any())
+    assert not bool(recognised_mapping(theirs, ours).any())
+
+
+def test_shapes_of_two_vroid_characters_are_the_same_whatever_their_meshes_are_called() -> None:
+    plain = ["Fcl_ALL_Joy", "Fcl_EYE_Close_L", "Fcl_EYE_Close_R", "Fcl_MTH_A", "Fcl_HA_Fung1"]
+    ours, theirs = ([f"Face.M_F00_00{number}_00_{name}" for name in plain] for number in (0, 1))
+    assert torch.equal(recognised_mapping(ours, theirs), torch.eye(5))
+    assert torch.equal(recognised_mapping(ours, plain), torch.eye(5))
+
+
 def test_metahumans_curves_are_driven_by_its_table_and_drive() -> None:
     assert torch.equal(recognised_mapping(ARKIT, METAHUMAN.names), METAHUMAN.from_arkit(torch.eye(len(ARKIT))).T)
     assert torch.equal(

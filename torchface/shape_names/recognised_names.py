@@ -21,7 +21,7 @@ _SUFFIX = re.compile(r"(_div\d+|_hd\d*|\.\d{3})$", re.IGNORECASE)
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
 _SIDE = {"l": "left", "r": "right", "lt": "left", "rt": "right"}
 _ONE_SIDE = re.compile(r"[_.]([LR])$", re.IGNORECASE)
-_SHARED_PREFIX = re.compile(r"(?:(?!(?:l|r|left|right)[^a-z0-9])[a-z0-9]*[^a-z0-9])+", re.IGNORECASE)
+_SHARED_PREFIX = re.compile(r"(?:(?!(?:l|r|left|right|fcl)[^a-z0-9])[a-z0-9]*[^a-z0-9])+", re.IGNORECASE)
 _SHARED_SUFFIX = re.compile(r"(?:[^a-z0-9](?!(?:l|r|left|right)(?![a-z0-9]))[a-z0-9]+)+$", re.IGNORECASE)
 _SPELLING = {"eyes": "eye", "brows": "brow", "eyebrow": "brow", "eyebrows": "brow", "lips": "lip"}
 
@@ -144,8 +144,9 @@ def recognised_shapes(names: Sequence[str]) -> dict[str, RecognisedShape]:
 
 
 def recognised_mapping(from_names: Sequence[str], to_names: Sequence[str]) -> Tensor:
-    """The matrix (N_to,N_from) of :func:`mapping`, which also matches other programs' names of ARKit's shapes, names
-    that all of a rig's begin or end with something, and MetaHuman's curves; to what ``mapping`` leaves alone.
+    """The matrix (N_to,N_from) of :func:`mapping`, which also matches other programs' names of ARKit's shapes,
+    MetaHuman's curves, and names of a rig whose names all begin or end with something, where ARKit's are among them; to
+    what ``mapping`` leaves alone.
 
     Example:
         >>> names = ["Head.jawOpen_Mesh", "Head.eyeBlink_L_Mesh"]
@@ -169,12 +170,16 @@ def recognised_mapping(from_names: Sequence[str], to_names: Sequence[str]) -> Te
 
 
 def _read_as_arkit(names: Sequence[str]) -> tuple[str, ...]:
-    """ARKit's name of each that has one, once each; the others without what all names begin or end with."""
+    """ARKit's name of each that has one, once each; the others without what all names begin or end with, where ARKit's
+    shapes have it too and are read without it: in ``eye_up`` and ``eye_down`` it is what the names are about."""
     names = tuple(names)
     start, end = _beginning(names), _beginning([name[::-1] for name in names])[::-1]
     before, after = _SHARED_PREFIX.match(start), _SHARED_SUFFIX.search(end)
     first, last = before.end() if before and len(names) > 1 else 0, len(after[0]) if after and len(names) > 1 else 0
     plain = [name[first : len(name) - last] or name for name in names]
+    known = {(arkit_name(name), arkit_name(short)) for name, short in zip(names, plain, strict=True)} - {(None, None)}
+    if not known or any(full is not None and short != full for full, short in known):
+        plain = list(names)
     read: list[str] = []
     for name, short in zip(names, plain, strict=True):
         arkit = arkit_name(name) or arkit_name(short)
