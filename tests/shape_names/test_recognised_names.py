@@ -14,6 +14,7 @@ from torchface.shape_names import (
     recognised_mapping,
     recognised_shapes,
 )
+from torchface.shape_names.recognised_names import arkit_count
 
 CC4 = [
     "A01_Brow_Inner_Up",
@@ -196,3 +197,8 @@ def test_metahumans_curves_are_driven_by_its_table_and_drive() -> None:
 def test_of_two_shapes_for_one_motion_one_is_driven() -> None:
     assert recognised_mapping(["jawOpen"], ["Jaw_Open", "jawOpen"]).tolist() == [[0], [1]]
     assert recognised_mapping(["jawOpen"], ["Jaw_Open", "A25_Jaw_Open"]).tolist() == [[1], [0]]
+
+
+def test_shapes_that_move_nothing_are_said_in_the_plural() -> None:
+    assert arkit_count(["jawOpen"], ["tongueOut"]) == "1 of ARKit's 52 (its tongueOut moves nothing)"
+    assert arkit_count([], ["jawOpen", "tongueOut"]) == "0 of ARKit's 52 (its jawOpen, tongueOut move nothing)"

@@ -194,7 +194,8 @@ def _beginning(names: Sequence[str]) -> str:
 
 def arkit_count(found: Collection[str], still: Sequence[str]) -> str:
     """How many of ARKit's 52 shapes a rig has, for people to read; those that move nothing do not count."""
-    return f"{len(found)} of ARKit's 52" + (f" (its {', '.join(still)} moves nothing)" if still else "")
+    moves = "moves" if len(still) == 1 else "move"
+    return f"{len(found)} of ARKit's 52" + (f" (its {', '.join(still)} {moves} nothing)" if still else "")
 
 
 def vowel_sources(name: str) -> dict[str, float]:

@@ -75,7 +75,7 @@ export function tellCharacter({ name, check: { driven, unknown, still, meshes } 
   const tongues = driven.filter((one) => shapes.get(one).sources.every(([row]) => row === TONGUE));
   const words = [`your face moves ${driven.length - tongues.length} of its ${driven.length + unknown.length + still.length} shapes`];
   if (tongues.length > 0) words.push(`${tongues.join(", ")} moves only when a phone sends the face: a camera does not see the tongue`);
-  if (still.length > 0) words.push(`its ${still.join(", ")} moves nothing`);
+  if (still.length > 0) words.push(`its ${still.join(", ")} ${still.length > 1 ? "move" : "moves"} nothing`);
   if (unknown.length > 0) words.push(`these stay still: ${listed(unknown)}`);
   const hint = driven.length === 0 ? ". Say below, at Names of shapes, which of ARKit's each of them means" : "";
   showCharacterLine(`${name}: ${words.join("; ")}${hint}`);

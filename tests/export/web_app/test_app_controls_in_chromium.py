@@ -11,6 +11,7 @@ from rig_samples import named_sheet, quad_sheet
 from test_gltf_viewers import WEB, node  # noqa: F401  (its packages)
 
 from torchface.io import load_take, save_mesh, save_rig
+from torchface.rig import BlendshapeRig
 from torchface.workflows.browser_app.character import load_character
 
 pytestmark = pytest.mark.browser
@@ -199,6 +200,15 @@ def test_a_character_that_cannot_be_used_is_explained_and_the_one_before_stays(o
     chooser.send_keys(str(tmp_path / "good.glb"))
     until(lambda: page.text("character-line") == "good.glb: your face moves 2 of its 2 shapes")
     assert page.problem == ""
+
+
+def test_shapes_that_move_nothing_are_said(opened: Open, tmp_path: Path) -> None:
+    rig = named_sheet(("jawOpen", "mouthClose", "jawLeft"))
+    deltas = rig.deltas * torch.tensor([1.0, 0.0, 0.0])[:, None, None]
+    save_rig(BlendshapeRig(rig.neutral, deltas, rig.names), tmp_path / "still.glb")
+    opened.page.driver.find_element("id", "file").send_keys(str(tmp_path / "still.glb"))
+    said = "still.glb: your face moves 1 of its 3 shapes; its mouthClose, jawLeft move nothing"
+    until(lambda: opened.page.text("character-line") == said)
 
 
 def test_names_of_shapes_are_changed_and_kept_for_the_character(opened: Open, tmp_path: Path) -> None:

@@ -329,8 +329,9 @@ def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path
     warned = replace(fits, remarks=("WARNING: takeo.ppm: the mouth hidden", "note: dark"))
     assert warned.verdict().startswith("result: partly usable")
     assert "; 1 warning below; " in warned.verdict()
-    dark = replace(fits, remarks=("WARNING: takeo.ppm: too dark: it shows 1/9 of the light",))
-    assert dark.verdict().startswith("result: poor, too dark to show the skin's colour")
+    assert replace(fits, dark=True).verdict().startswith("result: poor, too dark to show the skin's colour")
+    named = replace(fits, remarks=("WARNING: too dark room.jpg: the mouth hidden",))
+    assert named.verdict().startswith("result: partly usable")
 
 
 @pytest.mark.real

@@ -246,10 +246,13 @@ def test_light_from_one_side_is_remarked_on(right: tuple[float, ...], words: str
     shares[PARTS.index("skin")] = 1.0
     parts = FaceParts(shares, torch.tensor([[0.5, 0.0, 0.0], [0.0, 0.5, 0.0]], dtype=torch.float64))
     picture[:, :10] = 0.9  # something white
-    lines = light_lines(Path("a.png"), to_srgb(picture), parts, points)
+    lines, too_dark = light_lines(Path("too dark.png"), to_srgb(picture), parts, points)
+    assert not too_dark
     assert [words in line for line in lines] == [True] if words else lines == []
-    dim = light_lines(Path("a.png"), to_srgb(0.3 * picture), parts, points)
+    dim, too_dark = light_lines(Path("a.png"), to_srgb(0.3 * picture), parts, points)
     assert next(line for line in dim if "under-exposed" in line).startswith("note: a.png")
-    dark = light_lines(Path("a.png"), to_srgb(0.05 * picture), parts, points)
+    assert not too_dark
+    dark, too_dark = light_lines(Path("a.png"), to_srgb(0.05 * picture), parts, points)
+    assert too_dark
     assert re.match(r"WARNING: a\.png: too dark: it shows 1/\d+ of the light .* expected at least 1/5; ", dark[0]), dark
     assert not any("too fair" in line for line in dark)

@@ -16,10 +16,6 @@ MISFIT = 0.045
 """Of the eyes' distance: landmarks that lie further from the fit are remarked on; those found in three photographs
 of people at most 2.4 % without the contour."""
 
-NO_FACE_THERE = "finds no face where the given landmarks lie"
-"""In lines on given landmarks that are not on a face: such a fit is poor, however near it comes. Of five photographs
-with the landmarks of each, the finder saw a face there in the five right pairs and in none of the 20 others."""
-
 ONE_PERSON, OTHERS = 0.95, 0.25
 """Probabilities: photographs above the first show one person, those below the second are refused.
 
@@ -33,8 +29,10 @@ ALONE = FitSettings(transfers=0, unknown_deviation=0.0, least_noise=0.004)
 landmarks, as of a rendered head, would be sure of coefficients that the model's form of it decides."""
 
 NARROW, WIDE = -2.5, 3.5
-"""Standard deviations of the heads' width beside their height: 24 real faces have -2.3 (seen from the side) to 2.6."""
+"""Standard deviations of the heads' width beside their height: set by 24 real faces, which have -2.3 (seen from the
+side) to 2.6."""
 
+_NO_FACE_THERE = "finds no face where the given landmarks lie"
 _NEAR = 0.5
 _FOUND_EYES = 30.0  # pixels between the eyes' outer corners: of 18 faces in groups two smaller ones were not found
 
@@ -117,10 +115,14 @@ def one_person_lines(
 
 def landmark_lines(
     photographs: Sequence[Path], images: Sequence[Tensor], marks: Tensor, finder: str | Path, bare: BareFit
-) -> list[str]:
+) -> tuple[list[str], bool]:
     """Which given landmarks (I,68,2) of photographs (3,H,W) do not fit, and how those that are found do, for people
-    to read."""
-    lines = []
+    to read; and whether some are not on a face: such a fit is poor, however near it comes.
+
+    Of five photographs with the landmarks of each, the finder saw a face there in the five right pairs and in none of
+    the 20 others.
+    """
+    lines, stray = [], False
     for i, misfit in enumerate(
         misfits(bare(marks, list(range(len(marks))))).tolist()
     ):  # photographs, which differ in size
@@ -129,15 +131,17 @@ def landmark_lines(
         if misfit < MISFIT:
             large = float(eyes_distances(marks[i : i + 1])) >= _FOUND_EYES
             if faces and large and reading is None:
+                stray = True
                 lines.append(
-                    f"WARNING: {name}: {finder} {NO_FACE_THERE}, but {faces} elsewhere: are they of "
+                    f"WARNING: {name}: {finder} {_NO_FACE_THERE}, but {faces} elsewhere: are they of "
                     f"another photograph? Look at them in the image of the fit, or leave out --landmarks"
                 )
             continue
         said = f"{name}: the given landmarks do not fit well, residual {misfit:.1%} of the eyes' distance"
         if reading is None:
+            stray = True
             lines.append(
-                f"WARNING: {said}, expected less than {MISFIT:.1%}; {finder} {NO_FACE_THERE}: are they of another "
+                f"WARNING: {said}, expected less than {MISFIT:.1%}; {finder} {_NO_FACE_THERE}: are they of another "
                 f"photograph? Look at them in the image of the fit, or leave out --landmarks"
             )
             continue
@@ -147,7 +151,7 @@ def landmark_lines(
             + f"{said}; those that {finder} finds have {other:.1%}; look at both in the images of the fit"
             + (", and leave out --landmarks to take the found ones" if other < misfit else "")
         )
-    return lines
+    return lines, stray
 
 
 def _found_there(

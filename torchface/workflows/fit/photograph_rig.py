@@ -32,7 +32,6 @@ from torchface.synthetic.head.embedded_character import is_performers
 from torchface.viz.figures.landmark_dots import with_dots
 from torchface.workflows.fit.fit_checks import (
     ALONE,
-    NO_FACE_THERE,
     ONE_PERSON,
     OTHERS,
     eyes_distances,
@@ -52,7 +51,6 @@ from torchface.workflows.fit.fit_landmarks import (
 from torchface.workflows.fit.fit_readings import with_readings
 from torchface.workflows.fit.fitted_character import dressed_rig
 from torchface.workflows.fit.picture_checks import (
-    TOO_DARK,
     color_lines,
     cover_lines,
     edge_lines,
@@ -112,6 +110,8 @@ class FittedHead:
     heads: str = ""  # what there is to say of the head model
     shown: tuple[Path, ...] = ()  # the photographs, and the frames of videos, by their names
     grey: bool = False  # whether all of them are black and white
+    stray: bool = False  # whether given landmarks are not on a face
+    dark: bool = False  # whether one of them is too dark to show the skin's colour
 
     def verdict(self) -> str:
         """Whether the head is to be used, in a line; no landmark says whether skin and likeness are right."""
@@ -120,8 +120,7 @@ class FittedHead:
         fit = f"eyes, nose and mouth lie {off:.1%} of the eyes' distance from the landmarks"
         look = f"look at {self.overlays[0].name} first" if self.overlays else "look at the rig first"
         warned = sum(line.startswith("WARNING") for line in self.remarks)
-        stray = any(NO_FACE_THERE in line for line in self.remarks)
-        dark = any(TOO_DARK in line for line in self.remarks)
+        stray, dark = self.stray, self.dark
         word = "poor" if off > _POOR or stray or dark else "partly usable" if warned else "good"
         word += ", the given landmarks are not on a face that is found" if stray else ""
         word += ", too dark to show the skin's colour" if dark else ""
@@ -228,12 +227,15 @@ def fit_photographs(
         readings = FaceReading.stacked([one.face for one in found])
         fitting = with_readings(fitting, readings, found[0].places, rig)
     remarks = [line for one in found for line in picture_lines(one, insist)]
+    stray = dark = False
     whole = [one.face.landmarks for one in found] or marks
     for photograph, image, shown, points, every in zip(photographs, images, parts, marks, whole, strict=True):
         edge = edge_lines(photograph, (image.shape[2], image.shape[1]), every)
         remarks += color_lines(photograph, image, shown, points) if found else []
         remarks += [*edge, *cover_lines(photograph, shown, points, bool(edge))]
-        remarks += [] if settings.everything else light_lines(photograph, image, shown, points)
+        if not settings.everything:
+            of_light, too_dark = light_lines(photograph, image, shown, points)
+            remarks, dark = remarks + of_light, dark or too_dark
     alone = [bare(marks[i : i + 1], [i]) for i in range(len(marks))]
     remarks += width_lines(photographs, alone, heads, rig.neutral.landmarks)
     # The tracker has followed one face through a film.
@@ -244,7 +246,8 @@ def fit_photographs(
     if found:
         remarks += strange_lines(photographs, fit)
     else:
-        remarks += landmark_lines(photographs, images, marks, settings.landmark_model, bare)
+        of_landmarks, stray = landmark_lines(photographs, images, marks, settings.landmark_model, bare)
+        remarks += of_landmarks
     transferred = transfer_with_report(rig, fit.mesh, progress=progress)
     dressed = dressed_rig(transferred.rig, rig, fit, images, parts, marks, worn)
     made = dressed.rig
@@ -270,6 +273,8 @@ def fit_photographs(
         named.line,
         tuple(photographs),
         without_colors(images),
+        stray,
+        dark,
     )
 
 

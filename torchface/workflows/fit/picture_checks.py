@@ -43,8 +43,6 @@ _FLAT_GREY = 0.18  # share of pixels like their neighbours; 9 photographs at mos
 _CHEEK = 0.14  # of the distance of the eyes' outer corners
 _ONE_SIDE, _TWO_HUES = 2.5, 1.6  # factors; of 5 photographs 1.0 to 1.15 and 1.0 to 1.25, of a patchy one 1.5 and 2.1
 _DEVELOPED, _TOO_DARK = 1.4, 5.0  # factors of light
-TOO_DARK = "too dark"
-"""In lines on photographs from which skin cannot be told: such a fit is poor."""
 _PROFILE = 50.0  # degrees
 _GRID = 40
 _COVERS = {
@@ -141,12 +139,14 @@ def cover_lines(photograph: Path, parts: FaceParts, landmarks: Tensor, cut: bool
     return lines
 
 
-def light_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Tensor) -> list[str]:
-    """What a photograph's light keeps from the skin's own colour, for people to read; nothing in good light."""
+def light_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Tensor) -> tuple[list[str], bool]:
+    """What a photograph's light keeps from the skin's own colour, for people to read, nothing in good light; and
+    whether it is too dark to show that colour: such a fit is poor."""
     lines, gain, needed = list[str](), exposure_gain(image, parts), needed_gain(image, parts)
-    if needed > _TOO_DARK:
+    dark = needed > _TOO_DARK
+    if dark:
         lines.append(
-            f"WARNING: {photograph.name}: {TOO_DARK}: it shows 1/{needed:.0f} of the light of a well exposed "
+            f"WARNING: {photograph.name}: too dark: it shows 1/{needed:.0f} of the light of a well exposed "
             f"photograph, expected at least 1/{_TOO_DARK:.0f}; its light is multiplied by {gain:.1f} only, so the "
             f"painted skin is too dark; give a photograph in good light"
         )
@@ -157,16 +157,15 @@ def light_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Te
         )
     apart = _cheeks_apart(image, parts, landmarks)
     if apart is None:
-        return lines
+        return lines, dark
     light, hue = math.exp(abs(float(apart.mean()))), math.exp(abs(float(apart[2] - apart[0])))
-    if light < _ONE_SIDE and hue < _TWO_HUES:
-        return lines
-    return [
-        *lines,
-        f"WARNING: {photograph.name}: light from one side (cheeks differ by a factor of {light:.1f} in brightness, "
-        f"{hue:.1f} in blue over red; in even light by less than 1.3): shadows are evened out and their detail is "
-        f"lost; give one in even light",
-    ]
+    if light >= _ONE_SIDE or hue >= _TWO_HUES:
+        lines.append(
+            f"WARNING: {photograph.name}: light from one side (cheeks differ by a factor of {light:.1f} in brightness, "
+            f"{hue:.1f} in blue over red; in even light by less than 1.3): shadows are evened out and their detail is "
+            f"lost; give one in even light"
+        )
+    return lines, dark
 
 
 def _cheeks_apart(image: Tensor, parts: FaceParts, landmarks: Tensor) -> Tensor | None:
