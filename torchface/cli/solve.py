@@ -76,7 +76,8 @@ def solve(
             for the scale).
         align: Move the take onto the rig without a neutral frame. With neither, markers are in the rig's space.
         keep_rest: Do not subtract what is left at rest between a moved take and the rig.
-        slip: The helmet moves on the head: find its motion, and keep it out of the weights.
+        slip: The helmet moves on the head, or the head moves in the capture volume (with --align or --neutral): find
+            this motion, and keep it out of the weights.
         clean: Find swapped labels, spikes and markers that drift or fell off, and repair what is safe.
         frame_by_frame: Solve every frame on its own, with the markers' noise in the curves. Otherwise the whole take is
             solved at once: smooth curves, gaps interpolated, fast motion keeps its height.

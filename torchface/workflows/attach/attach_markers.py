@@ -75,7 +75,7 @@ class AttachReport:
         if self.fit.motion is not None:
             slid = float(self.fit.motion.translation.norm(dim=1).max())
             angle = float(self.fit.motion.degrees().norm(dim=1).max())
-            lines.append(f"helmet: moved by up to {slid:.1f} mm and {angle:.1f} degrees; solved along")
+            lines.append(f"helmet or head: moved by up to {slid:.1f} mm and {angle:.1f} degrees; solved along")
         if self.cleanup.defects:
             lines.append(f"cleanup: {self.cleanup.summary()}")
         return [*(f"warning: {warning}" for warning in self.warnings), *lines, *self._uncertain()]
