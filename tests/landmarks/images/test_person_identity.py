@@ -1,5 +1,6 @@
 """Who is followed is not lost to another's place."""
 
+import pytest
 import torch
 from torch import Tensor
 
@@ -49,10 +50,30 @@ def test_who_comes_out_half_hidden_does_not_become_the_other() -> None:
 
 def test_somebody_who_was_not_noticed_is_not_taken_for_who_is_hidden() -> None:
     known, strange = (face_look(one) for one in colors(2, seed=2))
+    other = torch.tensor([400.0, 180.0, 140.0, 1.0])
+    state = alone(known)
+    for _ in range(4):
+        state = after_boxes(state, boxes(other), YES, STEP)
+    assert bool(is_other(state, other[:3], strange, STEP))
+    assert not bool(is_other(state, other[:3], known, STEP))
+
+
+@pytest.mark.parametrize("lost", [1, 2, 10])
+@pytest.mark.parametrize("place", [(500.0, 185.0, 180.0), (400.0, 180.0, 140.0)])
+def test_one_alone_who_turned_or_was_lit_otherwise_while_lost_is_found(
+    lost: int, place: tuple[float, float, float]
+) -> None:
+    known, turned = (face_look(one) for one in colors(2, seed=3))
+    state, here = alone(known), torch.tensor([*place, 1.0])
+    for _ in range(lost):
+        state = after_boxes(state, torch.zeros(CANDIDATES, 4), YES, STEP)
+    state = after_boxes(state, boxes(here), YES, STEP)
+    assert not bool(is_other(state, here[:3], turned, STEP))
+
+
+def alone(look: Tensor) -> Tensor:
+    """What is known of one person after ten frames."""
     state = torch.zeros(IDENTITY)
     for _ in range(10):
-        state = after_face(after_boxes(state, boxes(OWN), YES, STEP), OWN[:3], known, (YES, NO), STEP)
-    for _ in range(4):
-        state = after_boxes(state, torch.zeros(CANDIDATES, 4), YES, STEP)
-    assert bool(is_other(state, torch.tensor([400.0, 180.0, 140.0]), strange, STEP))
-    assert not bool(is_other(state, torch.tensor([400.0, 180.0, 180.0]), known, STEP))
+        state = after_face(after_boxes(state, boxes(OWN), YES, STEP), OWN[:3], look, (YES, NO), STEP)
+    return state

@@ -105,9 +105,12 @@ def is_other(identity: Tensor, place: Tensor, look: Tensor, interval: Tensor) ->
     nearer = from_other < from_own * torch.where(hidden, _CLEARLY, 1.0)
     nearer = nearer & ((other[5] > 0.5 * interval) | (from_other < _BESIDE))  # else the other is seen beside this face
     same = (likeness >= _SAME) & (_apart(own, place[:2]) < _BESIDE)
-    nearer = nearer & ~(hidden & same & (counted_beside(identity).sum() > _ELSEWHERE))
-    theirs = _is_known(identity) & nearer
-    theirs = theirs | ((own[2] > 0) & hidden & (likeness < _STRANGE))  # somebody who was not noticed before
+    elsewhere = counted_beside(identity).sum() > _ELSEWHERE
+    nearer = nearer & ~(hidden & same & elsewhere)
+    # Who looks otherwise is somebody else, if one is known or was seen where the first one was not; else the first one
+    # has turned, or the light is another.
+    somebody = _is_known(identity) | ((own[2] > 0) & elsewhere)
+    theirs = (_is_known(identity) & nearer) | (somebody & hidden & (likeness < _STRANGE))
     return theirs & (from_own > torch.where(hidden, 0.0, _SURE)) & (own[5] < _FORGOTTEN)
 
 
@@ -127,9 +130,10 @@ def after_face(identity: Tensor, place: Tensor, look: Tensor, whose: tuple[Tenso
     other = torch.where(fresh, 0.0, other)
     followed = torch.cat([moved, other, counted_beside(identity), mixed])
     # Of two boxes that overlap the wrong one may have been taken for the other's.
-    mistaken = (other[5] <= 0) & (_likeness(identity, look) < _STRANGE)
-    mistaken = mistaken & ((other[2] <= 0) | (_apart(other, place[:2]) < _AROUND))
-    reached = (other[5] > 0) & (_distance(other, place, 1) < _REACH + _QUICK * other[5])
+    strange = _likeness(identity, look) < _STRANGE
+    mistaken = (other[5] <= 0) & strange & ((other[2] <= 0) | (_apart(other, place[:2]) < _AROUND))
+    within = _distance(other, place, 1) < _REACH + _QUICK * other[5]
+    reached = (other[5] > 0) & (within | ~strange)  # half a face that comes out looks like nobody
     passing = torch.cat([own, _moved(torch.where(mistaken, 0.0, other), place[:3], interval), identity[2 * _MOTION :]])
     return torch.where(seen, followed, torch.where(stranger & (reached | mistaken), passing, identity))
 
