@@ -274,7 +274,7 @@ def test_solve_cleans_a_slipping_take_and_reports_it(
     common = ("--attachment", shoot / "attachment.json", "--out", out, "--quiet")
     run("solve", shoot / "rig.glb", shoot / "dirty.c3d", *common, "--slip", "--clean", "--report", page)
     told = capsys.readouterr().err
-    assert "helmet: moved by up to" in told
+    assert "helmet or head: moved by up to" in told
     assert "swap M004 ↔ M021 100–129" in told
     html = (page / "index.html").read_text()
     assert "M004 ↔ M021" in html

@@ -83,8 +83,10 @@ def check_exchanged(capture: Capture, pair: tuple[int, int], share: float, which
     assert found.warnings == ()
 
 
-@pytest.mark.parametrize(("turn", "way"), [(0.9, 60.0), (0.12, 200.0)])
-def test_a_head_that_moves_freely_in_the_volume_costs_nothing(stage: Capture, turn: float, way: float) -> None:
+@pytest.mark.parametrize(("turn", "way", "free"), [(0.9, 60.0, False), (0.9, 200.0, True), (0.12, 200.0, False)])
+def test_a_head_that_moves_freely_in_the_volume_costs_nothing(
+    stage: Capture, turn: float, way: float, free: bool
+) -> None:
     rig, sites, _ = stage
     take, true = recorded(stage, frames=60)
     assert take.markers is not None
@@ -95,10 +97,24 @@ def test_a_head_that_moves_freely_in_the_volume_costs_nothing(stage: Capture, tu
     moved = (values - middle) @ turned.transpose(1, 2) + middle
     moved = moved + way * torch.stack([phase.sin(), 0 * phase, (2 * phase).cos()], 1)[:, None]
     freely = replace(take, markers=Track(take.markers.names, moved))
-    found = solve_markers(rig, sites, freely, AS_IN_THE_HOW_TO)
+    found = solve_markers(rig, sites, freely, replace(AS_IN_THE_HOW_TO, free_scale=free))
     assert mesh_error(rig, found, true) < 1.1 * clean_error(stage, 0, 60)
     with pytest.raises(AlignmentError, match=r"or of the head in the volume, .* add --slip"):
         solve_markers(rig, sites, freely, replace(AS_IN_THE_HOW_TO, slip=False))
+
+
+def test_wrong_markers_in_a_frame_are_no_motion_of_the_helmet(stage: Capture) -> None:
+    rig, sites, _ = stage
+    take, _ = recorded(stage, frames=60)
+    assert take.markers is not None
+    values = take.markers.values.clone()
+    values[20, 3] += 3000.0
+    values[40, 10:20] = values[40, 5]
+    spoiled = replace(take, markers=Track(take.markers.names, values))
+    steady, found = (solve_markers(rig, sites, one, AS_IN_THE_HOW_TO).motion for one in (take, spoiled))
+    assert steady is not None
+    assert found is not None
+    assert float((steady.translation - found.translation).norm(dim=1).max()) < 0.5
 
 
 @pytest.mark.parametrize(

@@ -25,6 +25,7 @@ _ARM = 30.0
 _MOTION_RIDGE = 1e-4
 _MAX_ITERATIONS, _MOTION_TOLERANCE = 6, 1e-4
 _ENOUGH = 6  # markers from which a motion is known beside the expression's
+_ROUGH_ROUNDS, _ROUGH = 4, 2.0  # millimetres: what is nearer counts in full
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,13 +227,18 @@ class HelmetSolver(nn.Module):
 def rough_motion(seen: Tensor, rest: Tensor) -> tuple[HelmetMotion, Tensor]:
     """How a frame's markers (T,M,3) lie beside their sites at rest (M,3) as a whole, and the frames (K,) that show it.
 
-    The others have no motion: they show too few markers.
+    The others have no motion: they show too few markers. Markers far from where most lie count little.
     """
     pivot = rest.mean(0)
     found = HelmetMotion.none(seen, pivot)
     rows = ((~torch.isnan(seen).any(-1)).sum(1) >= _ENOUGH).nonzero()[:, 0]
     if len(rows):
-        placed = similarity_transform(rest.expand_as(seen[rows]), seen[rows], scale=False)
+        sites, marks = rest.expand_as(seen[rows]), seen[rows]
+        placed = similarity_transform(sites, marks, scale=False)
+        for _ in range(_ROUGH_ROUNDS):  # spikes and exchanged labels count little
+            off = (placed.apply(sites) - marks).norm(dim=-1).nan_to_num(0.0)
+            usual = off.median(1, keepdim=True).values.clamp(min=_ROUGH)
+            placed = similarity_transform(sites, marks, 1 / (1 + (off / usual).square()), scale=False)
         found.rotation[rows] = placed.rotation
         found.translation[rows] = placed.rotation @ pivot + placed.translation - pivot
     return found, rows

@@ -21,7 +21,7 @@ from torchface.capture.markers import Cleanup, FitCheck, HelmetMotion
 from torchface.capture.markers.helmet_solver import rough_motion
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY
 from torchface.evaluation.mesh_errors import marker_offsets
-from torchface.geometry.similarity import Similarity
+from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, empty_frames
@@ -41,6 +41,8 @@ from torchface.workflows.solve.weight_stream import StreamReport
 # A take is cleaned again where its alignment moves a site farther after the first cleaning, mm.
 _REALIGNED = 0.1
 _SLIPS = 0.3  # of the sites' mean distance from their centre: farther no helmet slips
+_SHARE_MOVES = 0.05  # of the frames in which it does; in fewer it is markers that are wrong
+_SAME_SCALE = 0.03  # logarithm
 _MOST = 0.8  # of the samples, below which a take shows too little
 _STRAY = 8.0  # times the median distance: noise stays below it, spikes and exchanged labels do not
 _SHOWN_SPANS = 6
@@ -172,7 +174,9 @@ class SolveReport:
         if solution.motion is not None:
             translation = float(solution.motion.translation.norm(dim=1).max())
             rotation = float(solution.motion.degrees().norm(dim=1).max())
-            lines.append(f"helmet: moved by up to {translation:.1f} mm and {rotation:.1f} degrees; not in the weights")
+            lines.append(
+                f"helmet or head: moved by up to {translation:.1f} mm and {rotation:.1f} degrees; not in the weights"
+            )
         if solution.cleanup is not None:
             lines.append(f"cleanup: {solution.cleanup.summary()}")
             rows = solution.cleanup.table(gaps=False)
@@ -204,7 +208,7 @@ def solve_markers(
     alignment, raw = None, take
     if settings.align or settings.neutral is not None:
         progress("aligning the take with the rig")
-        alignment = align_take(rig, attachment, raw, settings.neutral, settings.insist, settings.free_scale)
+        alignment = _aligned(rig, attachment, raw, settings)
         take = _moved(raw, alignment.apply)
     solver = MarkerSolver(rig, attachment, sparsity=settings.sparsity, ridge=settings.ridge)
     fit = check_explained(solver, take, alignment is not None, settings.slip, settings.insist)
@@ -267,6 +271,28 @@ def _moved(take: Take, move: Callable[[Tensor], Tensor]) -> Take:
     return replace(take, markers=Track(take.markers.names, move(values.double()).to(values)))
 
 
+def _aligned(rig: BlendshapeRig, attachment: Attachment, take: Take, settings: SolveSettings) -> Similarity:
+    """The similarity that moves a take's markers into the rig's space, also of a head that moves freely.
+
+    Where such a head turns, its markers' mean places are those of a smaller face: its scale is that of each frame.
+    """
+    found = align_take(rig, attachment, take, settings.neutral, settings.insist, settings.free_scale)
+    if not (settings.slip and settings.free_scale):
+        return found
+    assert take.markers is not None
+    solver = MarkerSolver(rig, attachment)
+    seen, rest = solver.arrange(take.markers).double(), solver.rest.double()
+    seen = seen[rough_motion(seen, rest)[1]]
+    if not len(seen):
+        return found
+    scale = similarity_transform(seen, rest.expand_as(seen)).scale.median()
+    if abs(float((scale / found.scale[0]).log())) < _SAME_SCALE:
+        return found
+    scaled = _moved(take, lambda points: scale * points)
+    held = align_take(rig, attachment, scaled, settings.neutral, settings.insist, scale=False)
+    return Similarity(scale * held.scale, held.rotation, held.translation)
+
+
 def _rough_motion(solver: MarkerSolver, take: Take) -> HelmetMotion | None:
     """How each frame's markers lie as a whole, where a head moves freely in a volume; None where a helmet slips, whose
     motion is solved for with the weights."""
@@ -277,7 +303,7 @@ def _rough_motion(solver: MarkerSolver, take: Take) -> HelmetMotion | None:
         return None
     radius = float((rest - found.pivot).norm(dim=1).mean())
     moved = (found.apply(rest.expand(len(take), -1, -1)) - rest)[rows].norm(dim=-1).mean(1)
-    if float(moved.max()) < _SLIPS * radius:
+    if float(moved.quantile(1 - _SHARE_MOVES)) < _SLIPS * radius:
         return None
     nearest = rows[nearest_rows(rows, len(take))]
     return HelmetMotion(found.rotation[nearest], found.translation[nearest], found.pivot)
