@@ -78,12 +78,15 @@ def test_without_landmarks_the_copy_is_found_too(mask: Mesh, moved) -> None:
     assert float(error(result, copy.vertices).max()) < 0.3
 
 
-def test_a_second_head_on_the_scan_is_named(mask: Mesh) -> None:
-    apart = torch.tensor([400.0, 30.0, 0.0])
-    both = Mesh(
-        torch.cat([mask.vertices, mask.vertices + apart]), torch.cat([mask.faces, mask.faces + len(mask.vertices)])
+def beside_itself(mesh: Mesh) -> Mesh:
+    apart = torch.tensor([500.0, 30.0, -40.0])
+    return Mesh(
+        torch.cat([mesh.vertices, mesh.vertices + apart]), torch.cat([mesh.faces, mesh.faces + len(mesh.vertices)])
     )
-    short = Schedule(DEFAULT_SCHEDULE.stages[:1])
+
+
+def test_a_second_head_on_the_scan_is_named(mask: Mesh) -> None:
+    short, both = Schedule(DEFAULT_SCHEDULE.stages[:1]), beside_itself(mask)
     assert any("more than one place" in note for note in register(mask, both, schedule=short).record.notes)
     assert not any("more than one" in note for note in register(mask, mask, schedule=short).record.notes)
 
@@ -296,6 +299,13 @@ def real(data: Path, ict_folder: Path) -> RealScan:
     template = load_identity_modes(ict_folder, count=1, part="face").neutral
     scan = load_mesh(data / "scans" / "james" / "james.obj")
     return RealScan(template, scan, load_landmark_points(data / "scans" / "james" / "james.ljson").ibug())
+
+
+@pytest.mark.real
+def test_a_second_head_is_named_where_only_the_whole_template_fits(ict_folder: Path) -> None:
+    short, head = Schedule(DEFAULT_SCHEDULE.stages[:1]), load_rig(ict_folder).neutral
+    made = register(neutral_head(texture=False), beside_itself(head), schedule=short, texture_size=0)
+    assert any("more than one place" in note for note in made.record.notes)
 
 
 @pytest.mark.real

@@ -1,6 +1,6 @@
 """Where a template starts on a scan: the similarity by landmarks or by its shape, and which side of the scan is out."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import product
 
@@ -17,7 +17,7 @@ from torchface.registration.nonrigid.schedule import Schedule
 from torchface.registration.scan_preparation import Landmarks, PreparedScan, check_landmarks
 
 _RIGID_SAMPLES = 1500
-_OTHER_SHARE, _BESIDE = 0.25, 0.1  # of the scan's points; of the template's size
+_OTHER_SHARE, _BESIDE = 0.15, 0.1  # of the scan's points; of the template's size
 _RIGID_REACHES = (20.0, 17.0, 14.0, 12.0, 10.0, 8.0)
 _SIZES, _SURE_FIT = (1.0, 0.85, 1.15), 0.6  # of a template that looks for its place by shape; of its face there
 
@@ -81,8 +81,25 @@ def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: 
         ids = exposed[notes.regions["face"].cpu()[exposed]]
         vertices = template.vertices.detach().cpu().double()
         face = Samples.of(vertices, template.faces.cpu(), evenly_spread(vertices, ids, _RIGID_SAMPLES))
+    try:
+        best, pose = _best_pose(samples, face, scan, _SIZES)
+    except AlignmentError as error:
+        raise AlignmentError(
+            f"register: the template lies nowhere on the scan by its shape alone: {error}; give landmarks"
+        ) from error
+    if best >= _SURE_FIT:
+        return pose, _other_heads(samples, face, scan, pose)
+    return pose, [
+        f"the face was found by its shape alone and fits {best:.2f} of 1 there, where heads fit {_SURE_FIT} and more: "
+        "look at the registered mesh (torchface register writes NAME.glb and contact_sheet.png), and give landmarks if "
+        "it lies elsewhere"
+    ]
+
+
+def _best_pose(samples: Samples, face: Samples, scan: ScanPoints, sizes: Sequence[float]) -> tuple[float, Similarity]:
+    """How well the face fits, and the pose: the first of the template or its face that is sure, else the best."""
     best, pose, refused = -1.0, None, AlignmentError("")
-    for size, some in product(_SIZES, (samples,) if face is samples else (samples, face)):
+    for size, some in product(sizes, (samples,) if face is samples else (samples, face)):
         try:
             found = find_pose(some, scan, size).pose
         except AlignmentError as error:
@@ -92,16 +109,10 @@ def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: 
         if fit > best:
             best, pose = fit, found
         if best >= _SURE_FIT:
-            return found, _other_heads(samples, face, scan, found)
+            break
     if pose is None:
-        raise AlignmentError(
-            f"register: the template lies nowhere on the scan by its shape alone: {refused}; give landmarks"
-        )
-    return pose, [
-        f"the face was found by its shape alone and fits {best:.2f} of 1 there, where heads fit {_SURE_FIT} and more: "
-        "look at the registered mesh (torchface register writes NAME.glb and contact_sheet.png), and give landmarks if "
-        "it lies elsewhere"
-    ]
+        raise refused
+    return best, pose
 
 
 def _other_heads(samples: Samples, face: Samples, scan: ScanPoints, found: Similarity) -> list[str]:
@@ -114,16 +125,16 @@ def _other_heads(samples: Samples, face: Samples, scan: ScanPoints, found: Simil
         return []
     rest = ScanPoints(scan.points[left], scan.normals[left], scan.border[left])
     try:
-        other = find_pose(face, rest, float(found.scale[0]))
+        fit, other = _best_pose(samples, face, rest, (float(found.scale[0]),))
     except AlignmentError:
         return []
-    if float(other.fit[0]) < _SURE_FIT:
+    if fit < _SURE_FIT:
         return []
     taken, not_taken = (
         "("
         + ", ".join(f"{number:.0f}" for number in pose.apply(face.points.mean(0, keepdim=True))[0, 0].tolist())
         + ")"
-        for pose in (found, other.pose)
+        for pose in (found, other)
     )
     return [
         f"the face fits in more than one place: the one at {taken} was taken, another is at {not_taken}, millimetres; "
