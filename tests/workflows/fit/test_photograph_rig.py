@@ -335,6 +335,16 @@ def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path
 
 
 @pytest.mark.real
+def test_a_dark_photograph_makes_a_poor_result_and_a_name_that_says_so_does_not(data: Path, tmp_path: Path) -> None:
+    folder, settings = data / "images" / "people", PhotographSettings(fit=FitSettings(texture_size=0))
+    photograph, marks = load_image(folder / "lfpw_2.png"), [folder / "lfpw_2.pts"]
+    for name, light, poor in (("too dark room.png", 1.0, False), ("a.png", 0.2, True)):
+        save_image(light * photograph, tmp_path / name)
+        made = fit_photographs([tmp_path / name], marks, None, tmp_path / "rig.glb", settings)
+        assert made.verdict().startswith("result: poor, too dark to show") == poor, made.verdict()
+
+
+@pytest.mark.real
 def test_landmarks_of_another_photograph_make_a_poor_result(data: Path, tmp_path: Path) -> None:
     folder, settings = data / "images" / "people", PhotographSettings(fit=FitSettings(texture_size=0))
     made = fit_photographs([folder / "lfpw_1.png"], [folder / "lfpw_2.pts"], None, tmp_path / "rig.glb", settings)
