@@ -11,11 +11,21 @@ from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io.gltf.part_textures.iris_texture import painted_eye
+from torchface.landmarks.images.networks.part_finder import FaceParts
+from torchface.landmarks.images.networks.part_network import PARTS
 from torchface.mesh import Mesh
 from torchface.modeling.photographs.eye_color import iris_color, with_iris
-from torchface.modeling.photographs.image_texture import _spectacles, _View, part_vertices, with_part_colors
+from torchface.modeling.photographs.fit_settings import FitSettings
+from torchface.modeling.photographs.image_texture import (
+    _spectacles,
+    _View,
+    part_vertices,
+    photographed_skin,
+    with_part_colors,
+)
 from torchface.modeling.photographs.skin_light import like_skin_around
 from torchface.modeling.photographs.skin_mask import FacePlaces
+from torchface.registration.scan_colors import own_colors
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import neutral_head, performer
 
@@ -101,6 +111,23 @@ def test_frames_count_where_a_photograph_shows_enough_of_glasses() -> None:
     assert torch.equal(_spectacles([view], [shown]), places.frames)
     assert not _spectacles([view], [shown * 0.2]).any()
     assert not _spectacles([view], [shown * (torch.arange(len(shown)) % 60 == 0)]).any()
+
+
+def test_brows_that_the_network_takes_for_skin_stay_also_behind_glasses() -> None:
+    head = neutral_head()
+    camera = look_at(head.vertices[head.landmarks[27:48]].mean(0), 0.0, span=260.0, width=400, height=400)
+    picture = render(head, camera, lighting=EVEN, samples=1)
+    shares = torch.zeros(len(PARTS), 100, 100)
+    shares[PARTS.index("skin")] = 0.7
+    shares[PARTS.index("glasses")] = 0.3 + 0.02
+    parts = FaceParts(shares, torch.tensor([[0.25, 0.0, 0.0], [0.0, 0.25, 0.0]]).double())
+    settings = FitSettings(parts=[parts], texture_size=512, paint_hair=False)
+    found = photographed_skin([head], None, [picture], [camera], settings).colors
+    brow = FacePlaces.of(head).brow
+    drawn = own_colors(head)[brow].mean(1)
+    dark = drawn < drawn.median() - 0.15
+    assert int(dark.sum()) >= 10
+    assert float((found[brow].mean(1) - drawn)[dark].mean()) < 0.05
 
 
 def test_strands_and_red_folds_are_nearer_to_the_skin_around_and_moles_stay() -> None:

@@ -245,7 +245,7 @@ def _without_sharp_shadows(
     doubt = torch.stack([view.parts.doubt for view in views]).amax(0)
     shaded = ((graph.smoothed(added[:, None], bare, _TONE)[:, 0] - _EVEN[0]) / (_EVEN[1] - _EVEN[0])).clamp(0, 1)
     image = texture.image.flatten(1)[:, texture.texels.texels].T.double()
-    flat = torch.maximum(bare * places.rim * torch.maximum(shaded, doubt), places.lids * ~others)
+    flat = torch.maximum(bare * places.rim * torch.maximum(shaded, doubt), places.lids * ~(places.brow | others))
     flat = torch.maximum(flat, doubt * ~(places.features | others))  # strands
     # What no photograph shows has another tone: seen skin comes near it toward its edge, over a broad band.
     apart, seen = places.features | others, texture.seen.double()
@@ -257,9 +257,9 @@ def _without_sharp_shadows(
     image, colors = image + texture.texels.interpolate(step, faces), colors + step
     tone = tone + step
     for weight, most in (
-        (bare * places.rim, _FOLDS),
+        (bare * places.rim * ~places.brow, _FOLDS),
         (flat, _PORES),
-        (frames * ~others, _FRAMED_SKIN),
+        (frames * ~(places.brow | others), _FRAMED_SKIN),
     ):
         at = texture.texels.interpolate(torch.cat([tone, weight.double()[:, None]], dim=1), faces)
         image = torch.lerp(image, like_skin_around(image, at[:, :3], *most), at[:, 3:])
