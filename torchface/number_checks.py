@@ -164,7 +164,7 @@ def _range_text(kind: str, least: float, most: float, above: bool = False) -> st
     if math.isinf(most) or most == 2**31 - 1:
         return f"{kind} above {least:g}" if above else kind if math.isinf(least) else f"{kind} of at least {least:g}"
     low = f"above {least:g} and at most " if above else f"from {least:g} to "
-    return f"{kind} {low}{most:.7g}"
+    return f"{kind} {low}{most if isinstance(most, int) else f'{most:.7g}'}"
 
 
 def _shown(value: object) -> str:

@@ -17,6 +17,7 @@ from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import plain_errors, print_lines
 from torchface.errors import TorchfaceError, ValueRangeError
 from torchface.files.job_lock import job_lock
+from torchface.files.model_roots import check_model_name
 from torchface.files.whole_files import made_folder, make_folder
 from torchface.progress import Progress, silent
 
@@ -71,6 +72,8 @@ def recipe(body: Callable[[Settings, Run], Trained]) -> Train[Settings, Trained]
 
 @contextmanager
 def _running(settings: RecipeSettings, progress: Progress) -> Iterator[Run]:
+    for folder in settings.folders:  # else refused after all the work, when the model is saved
+        check_model_name(folder)
     device = settings.chosen_device()
     if not settings.resume:
         settings.forget()

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -180,13 +181,15 @@ def test_the_help_shows_one_value_where_an_option_is_given_again_for_each(
         ("live 0 --to osc://a:1 vmc://b:2", "again for each: --to osc://a:1 --to vmc://b:2"),
         ("convert a.obj --out b.glb", "OUT has a place and no flag: torchface convert a.obj b.glb"),
         ("convert a.obj -o b.glb", "OUT has a place and no flag: torchface convert a.obj b.glb"),
+        ("convert 'my a.obj' -o b.glb", "OUT has a place and no flag: torchface convert 'my a.obj' b.glb"),
+        ("convert a.glb 's l i p.csv' --out b.glb", "OUT has a place and no flag: torchface convert FILE OUT"),
     ],
 )
 def test_an_option_given_in_the_way_of_another_is_refused_with_the_right_way(
     words: str, hint: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit, match="2"):
-        main(words.split())
+        main(shlex.split(words))
     assert hint in " ".join(capsys.readouterr().err.split())
 
 

@@ -275,3 +275,13 @@ def test_output_that_nobody_reads_ends_quietly(words: str) -> None:
     run.stdout = None
     assert run.communicate("")[1] == ""
     assert run.returncode == 141
+
+
+def test_a_seed_is_checked_before_libraries_are_loaded(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "torchface.workflows.demo.run_demo", None)  # whose import fails
+    with pytest.raises(SystemExit, match="2"):
+        main(["demo", "--seed", "-1", "--out", str(tmp_path / "out")])
+    told = " ".join(capsys.readouterr().err.split())
+    assert "--seed: found -1, expected a whole number from 0 to 4294967295" in told

@@ -135,8 +135,8 @@ def test_what_a_file_cannot_say_is_named(
     [
         ({"slope": -0.5}, "slope: found -0.5, expected a finite number of at least 0"),
         ({"parts": [1, -1]}, "parts: found -1, expected a whole number from 0"),
-        ({"limit": 2**62}, "limit: found 4.611686e+18, expected a whole number from 0 to 1e+07"),
-        ({"seed": -1}, "seed: found -1, expected a whole number from 0 to 4.294967e+09"),
+        ({"limit": 2**62}, "limit: found 4.611686e+18, expected a whole number from 0 to 10000000"),
+        ({"seed": -1}, "seed: found -1, expected a whole number from 0 to 4294967295"),
         ({"network": {"workers": -1}}, "network.workers: found -1, expected a whole number"),
     ],
 )
@@ -149,6 +149,18 @@ def test_a_number_that_no_recipe_can_work_with_is_refused_before_any_work(
     assert ended.value.code == 2
     assert message in " ".join(capsys.readouterr().err.split())
     assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_whose_name_no_model_can_have_is_refused_before_any_work(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def work(settings: Settings, run: Run) -> None:
+        pytest.fail("the work has begun")
+
+    with pytest.raises(SystemExit):
+        Recipe(Settings, recipe(work), None).main(["--data", "here", "--out", str(tmp_path / "my model")])
+    assert "found the name 'my model', expected letters, digits, - and _" in " ".join(capsys.readouterr().err.split())
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", RECIPES)

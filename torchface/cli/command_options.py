@@ -8,6 +8,7 @@ from functools import wraps
 from inspect import signature
 from itertools import takewhile
 from pathlib import Path
+from shlex import join
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -135,16 +136,25 @@ def plain_options(command: Command) -> Command:
 
 def usage_hints(command: Callable[..., Any], words: Sequence[str]) -> Iterator[str]:
     """What tyro does not say of options that it refused: which are given again, and which have a place and no flag."""
-    for name, hint in get_type_hints(command, include_extras=True).items():
+    hints = get_type_hints(command, include_extras=True)
+    for name, hint in hints.items():
         flag, notes = f"--{name.replace('_', '-')}", getattr(hint, "__metadata__", ())
         flags = (flag, "-o") if name == "out" else (flag,)
         if Positional in notes and any(word.split("=")[0] in flags for word in words):
+            marks = {one: getattr(other, "__metadata__", ()) for one, other in hints.items()}
+            places = [_place(one, among) for one, among in marks.items() if Positional in among]
             given = [word for word in words if not word.startswith("-")]
-            yield f"{name.upper()} has a place and no flag: torchface {command.__name__} {' '.join(given)}"
+            right = join(given) if len(given) == len(places) else " ".join(places)  # of more, which is not known
+            yield f"{name.upper()} has a place and no flag: torchface {command.__name__} {right}"
         for at, word in enumerate(words):
             values = [*takewhile(lambda value: not value.startswith("-"), words[at + 1 :])]
             if UseAppendAction in notes and word == flag and len(values) > 1:
                 yield f"{flag} takes one value and is given again for each: {' '.join(f'{flag} {v}' for v in values)}"
+
+
+def _place(name: str, notes: Sequence[Any]) -> str:
+    """What the help calls an argument that has a place."""
+    return next((note.metavar for note in notes if getattr(note, "metavar", None)), name.upper())
 
 
 def _choices(kind: Any) -> PrimitiveConstructorSpec[Any] | None:

@@ -35,12 +35,13 @@ def demo(
         out: Folder for the report, rig, take, weights, animation and solver.
         seed: Decides the random head, the noise and the gaps.
     """
-    from torchface.files.job_lock import job_lock
     from torchface.number_checks import LARGEST_SEED, checked_count
+
+    checked_count("--seed", seed, 0, LARGEST_SEED)
+    from torchface.files.job_lock import job_lock
     from torchface.workflows.demo.demo_page import result_rows, scene_rows, write_demo_page
     from torchface.workflows.demo.run_demo import run_demo, scene_from
 
-    checked_count("--seed", seed, 0, LARGEST_SEED)
     with job_lock(out), progress_bars(quiet) as progress:
         if (out / _FILES[0]).exists() and not (out / "index.html").exists():
             console.print(f"{out}: an earlier run did not come to its end; this one begins anew", highlight=False)

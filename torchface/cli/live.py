@@ -62,8 +62,8 @@ def live(
             vrchat://HOST:9000, vts://HOST:8001 (VTube Studio), ifacialmocap://HOST:49983. Options of an address:
             ?rate=30 (frames a second at most), map=FILE (a mapping table), names=arkit+vrm0+vrm1 (vmc).
         record: Record from the first frame on into this folder: weights.csv by the character's names, live_link.csv,
-            animation.glb (the character's own file with weights, head, neck and eyes), summary.json. The page's button
-            records into `recordings` without.
+            animation.glb (the character's own file with weights, head, neck and eyes), summary.json; where it holds a
+            take, into a folder take_2 of it. The page's button records into `recordings` without.
         takes: The folder of the page's takes, where its button records too; recordings that lie in it (CSV of Live Link
             Face, iFacialMocap's and Face Cap's text, JSON of face anchors) become takes. `recordings` if absent.
         page: Open the page in the browser.

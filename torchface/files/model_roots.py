@@ -4,11 +4,17 @@ import re
 from functools import cache
 from pathlib import Path
 
-from torchface.errors import FileFormatError, TorchfaceError
+from torchface.errors import FileFormatError, NameMismatchError, TorchfaceError
 from torchface.files.documents import read_toml
 from torchface.files.models import DESCRIPTION
 
 MODEL_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
+
+
+def check_model_name(folder: Path) -> None:
+    """Raises ``NameMismatchError`` where a folder's name is none for a model."""
+    if not MODEL_NAME.fullmatch(folder.name):
+        raise NameMismatchError(f"{folder}: found the name {folder.name!r}, expected letters, digits, - and _")
 
 
 def model_roots(package: Path, home: str | None) -> list[Path]:

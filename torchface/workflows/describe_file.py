@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING
 
 import torch
@@ -157,8 +158,8 @@ def _check_rig_folder(folder: Path) -> None:
     """Raises ``FileFormatError`` for folders that are no rig of OBJ files, with what holds what is in them."""
     if (folder / DESCRIPTION).is_file():
         raise FileFormatError(
-            f"{folder}: found a learned model, expected a rig; `torchface zoo describe {folder}` shows what is known "
-            "of it"
+            f"{folder}: found a learned model, expected a rig; `torchface zoo describe "
+            f"{quote(str(folder))}` shows what is known of it"
         )
     scenes = [path.name for path in sorted(folder.iterdir()) if path.suffix.lower() in SCENE_ENDINGS]
     if scenes and sum(path.suffix.lower() == ".obj" for path in folder.iterdir()) < 2:

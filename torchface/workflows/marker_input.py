@@ -79,7 +79,8 @@ def read_markers(path: Path, labels: Sequence[str] | None, options: MarkerOption
         raise NameMismatchError(f"{path}: {error}") from error
     chosen = take.markers.select(match.channels)
     values = chosen.values if options.flip is None else _flipped(chosen.values, options.flip)
-    return replace(take, markers=Track(match.labels, values, chosen.confidence)), match.notes()
+    markers, extras = Track(match.labels, values, chosen.confidence), {**take.extras, "flipped": options.flip}
+    return replace(take, markers=markers, extras=extras), match.notes()
 
 
 def _flipped(values: Tensor, axis: str) -> Tensor:

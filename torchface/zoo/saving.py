@@ -8,7 +8,7 @@ from typing import Any
 from torch import nn
 
 from torchface.errors import NameMismatchError
-from torchface.files.model_roots import MODEL_NAME
+from torchface.files.model_roots import check_model_name
 from torchface.files.models import ModelRecord, write_model
 from torchface.zoo.kinds import KINDS
 
@@ -70,8 +70,7 @@ def save_model(model: nn.Module, folder: str | Path, card: ModelCard, half: Coll
         known = ", ".join(model_class.__name__ for model_class in KINDS.values())
         raise NameMismatchError(f"save_model: found a {type(model).__name__}, expected one of {known}")
     folder = Path(folder)
-    if not MODEL_NAME.fullmatch(folder.name):
-        raise NameMismatchError(f"{folder}: found the name {folder.name!r}, expected letters, digits, - and _")
+    check_model_name(folder)
     record = ModelRecord(
         kinds[0], card.licence, card.data, dict(card.metrics), card.recipe, card.url, dict(card.settings)
     )

@@ -174,9 +174,9 @@ def test_another_animation_is_refused_with_what_is_wrong(folder: Path, rig: Blen
     save_mesh(Mesh(rig.vertices, rig.neutral.faces.flip(0)), tmp_path / "frame.obj")
     with pytest.raises(FileFormatError, match=r"triangle 0 of vertices .* another order"):
         animation_to_weights(folder / "rig.glb", tmp_path / "frame.obj", tmp_path / "w.csv", ALONE, silent)
-    (tmp_path / "hero.fbx").touch()
-    with pytest.raises(FileFormatError, match=r"torchface convert .*hero\.fbx .*hero\.glb reads it with Blender"):
-        arkit_head(tmp_path / "hero.fbx", tmp_path / "a.glb", None, None, False, None, silent)
+    (tmp_path / "my hero.fbx").touch()
+    with pytest.raises(FileFormatError, match=r"torchface convert '.*my hero\.fbx' '.*my hero\.glb' reads it with"):
+        arkit_head(tmp_path / "my hero.fbx", tmp_path / "a.glb", None, None, False, None, silent)
 
 
 def test_frames_that_are_no_faces_of_the_head_are_named(

@@ -148,6 +148,12 @@ def test_the_command_plays_records_and_says_what_is_wrong(
     assert said.out.strip() == str(out)
     assert "1 of 5: Look into the camera" in said.err
     assert len(load_take(out / "live_link.csv")) >= 1
+    kept = {path: path.read_bytes() for path in out.iterdir()}
+    main(["live", str(played), "--character", str(dome), "--no-page", "--record", str(out), "--quiet"])
+    said = capsys.readouterr()
+    assert said.out.strip() == str(out / "take_2")
+    assert f"{out} holds a take, which is kept: this one is recorded into {out / 'take_2'}" in said.err
+    assert all(path.read_bytes() == before for path, before in kept.items())
     for words, told in (
         ((played, "--to", "vmc://no-such-host.invalid"), "whose host is not known"),
         ((played, "--to", "midi://h:1"), "expected an address such as"),

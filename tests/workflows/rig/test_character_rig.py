@@ -193,17 +193,17 @@ def test_files_that_are_no_characters_are_refused(tmp_path: Path) -> None:
         FileFormatError, match=r"install Blender.*import_scene\.fbx\(filepath='.*hero\.fbx'\).*hero\.glb'"
     ):
         check_character(tmp_path / "hero.fbx")
-    with pytest.raises(FileFormatError, match=r"found '\.jpg'.*torchface fit .*face\.jpg"):
-        check_character(tmp_path / "face.jpg")
+    with pytest.raises(FileFormatError, match=r"found '\.jpg'.*torchface fit '.*my face\.jpg' --out 'my face\.glb'"):
+        check_character(tmp_path / "my face.jpg")
     with pytest.raises(FileFormatError, match=r"expected.*\.glb"):
         rig_character(empty, tmp_path / "out.obj")
     with pytest.raises(FileFormatError, match="found a folder"):
         check_character(tmp_path)
     with pytest.raises(FileFormatError, match="no such file"):
         check_character(tmp_path / "hero.obj")
-    (tmp_path / "hero.obj").touch()
-    with pytest.raises(FileFormatError, match=r"torchface arkit .*hero\.obj --out .*hero\.glb"):
-        check_character(tmp_path / "hero.obj")
+    (tmp_path / "my hero.obj").touch()
+    with pytest.raises(FileFormatError, match=r"torchface arkit '.*my hero\.obj' --out 'my hero\.glb'"):
+        check_character(tmp_path / "my hero.obj")
 
 
 def test_options_of_scans_are_refused_for_a_character(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -120,6 +120,12 @@ def test_a_mirrored_take_is_refused_and_flipped_by_hand(stage: Path, capsys: pyt
     right = load_take(solve(stage, stage / "take.c3d", *each)).weights
     again = load_take(solve(stage, take, *each, "--flip", "y")).weights
     torch.testing.assert_close(again.values, right.values, atol=5e-3, rtol=0)
+    capsys.readouterr()
+    with pytest.raises(SystemExit):
+        solve(stage, stage / "take.c3d", "--align", "--flip", "x")
+    printed = " ".join(capsys.readouterr().err.split())
+    assert "leave out --flip x, or rename the labels" in printed
+    assert "negate" not in printed
 
 
 def aligned_scale(said: str) -> float:

@@ -157,15 +157,23 @@ def sample_limits(distance: Tensor) -> Tensor:
     return torch.minimum(own, _MAX_LIMIT_RATIO * own.median())
 
 
-def check_not_mirrored(paths: Tensor, rest: Tensor, name: str = "markers") -> None:
-    """Raises ``AlignmentError`` where the mirror image of a take's median fits the sites (M,3) clearly better."""
+def check_not_mirrored(paths: Tensor, rest: Tensor, name: str, flipped: str | None) -> None:
+    """Raises ``AlignmentError`` where the mirror image of a take's median fits the sites (M,3) clearly better.
+
+    ``flipped`` is the axis whose coordinates were negated already, if any.
+    """
     found = check_mirrored(paths.nanmedian(0).values, rest)
     if found.mirrored:
+        cause = (
+            "the coordinates are left-handed, or the labels of left and right are swapped: export with right-handed "
+            "axes or negate one axis (--flip x of torchface solve and attach; with --align any axis will do)"
+            if flipped is None
+            else f"the coordinates were right-handed before --flip {flipped}, or the labels of left and right are "
+            f"swapped: leave out --flip {flipped}"
+        )
         raise AlignmentError(
-            f"{name}: the markers are a mirror image of their sites: {found.figures()} are left; the coordinates are "
-            "left-handed, or the labels of left and right are swapped: export with right-handed axes or negate one "
-            "axis (--flip x of torchface solve and attach; with --align any axis will do), or rename the labels "
-            "(--labels)"
+            f"{name}: the markers are a mirror image of their sites: {found.figures()} are left; {cause}, or rename "
+            "the labels (--labels)"
         )
 
 

@@ -78,7 +78,7 @@ def align_take(
     affine, paths = _seen_sites(rig, attachment, take)
     rest = affine[..., 0]
     if not insist:
-        check_not_mirrored(paths, rest, str(take.extras.get("source", "take")))
+        check_not_mirrored(paths, rest, str(take.extras.get("source", "take")), take.extras.get("flipped"))
     if neutral_frame is not None:
         if not 0 <= neutral_frame < len(paths):
             raise ValueRangeError(

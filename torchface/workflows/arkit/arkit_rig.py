@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import join
 
 import torch
 from torch import Tensor
@@ -88,7 +89,8 @@ def load_source(path: Path, unit: str | None = None) -> Source:
     if path.is_file() and path.suffix.lower() not in SCENE_ENDINGS:
         known = ", ".join((*SCENE_ENDINGS, *MESH_ENDINGS, *HEAD_MODEL_ENDINGS))
         how = path.suffix.lower() in BLENDER_ENDINGS
-        convert = f" (torchface convert {path} {path.with_suffix('.glb')} reads it with Blender)" if how else ""
+        words = join(["torchface", "convert", str(path), str(path.with_suffix(".glb"))])
+        convert = f" ({words} reads it with Blender)" if how else ""
         raise FileFormatError(f"{path}: found {path.suffix!r}{convert}, expected {known}, or a folder of OBJ files")
     try:
         rig = load_rig(path, unit)

@@ -228,7 +228,7 @@ def attach(
         start = sites_by_shape(loaded, take)
     elif not settings.insist:
         sites = start.on(loaded.neutral.faces, loaded.vertices)
-        check_not_mirrored(marker_paths(take, start), sites, str(rom))
+        check_not_mirrored(marker_paths(take, start), sites, str(rom), take.extras.get("flipped"))
     free_scale = settings.options.frees_scale(rom)
     fit, cleanup = cleaned_fit(loaded, take, start, settings.standoff, progress, free_scale)
     on_helmet = helmet_markers(fit, take)

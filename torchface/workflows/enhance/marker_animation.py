@@ -141,7 +141,7 @@ def _pose(path: Path, take: Take, sites: MarkerSites, shell: ThinShell, neutral:
         translation = onto.apply(pose.translation.to(onto.translation)[:, None])[0]
         return Similarity(scale, rotation, translation)
     paths = take.markers.values.double()
-    check_not_mirrored(paths, shell.rest.double(), str(path))
+    check_not_mirrored(paths, shell.rest.double(), str(path), take.extras.get("flipped"))
     middle = paths.nanmedian(0).values if neutral is None else paths[neutral]
     check_not_collinear(middle[torch.isfinite(middle).all(-1)])
     pose = similarity_transform(middle[None], shell.rest.double()[None])

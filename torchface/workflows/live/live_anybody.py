@@ -219,7 +219,9 @@ def go_live(
             import_recordings(settings.takes, recordings, notes)
         session = LiveSession(source, solver, streams, recordings, notes, say, watch)
         if settings.record is not None:
-            recordings.start(settings.record)
+            place = recordings.start()
+            if place != settings.record:
+                notes(f"{settings.record} holds a take, which is kept: this one is recorded into {place}")
         session.guided = settings.calibrate
         if settings.calibrate and page is None:
             session.calibrate()

@@ -167,9 +167,9 @@ class Recordings:
         """Takes what names of the character's shapes mean, see :meth:`Character.renamed`."""
         self._character = self._given.renamed(meanings)
 
-    def start(self, place: Path | None = None, filmed: bool = False) -> Path:
-        """Begins a take, maybe with the camera's film, and returns its folder; it replaces the files of ``place``."""
-        self._place = place or self._next()
+    def start(self, filmed: bool = False) -> Path:
+        """Begins a take, maybe with the camera's film, and returns its folder, in which no take lies."""
+        self._place = self._next()
         self._begun.add(self._place)
         self._log, self._found = self._new_log(self._place), 0
         self._film = TakeFilm(self._place / FILM) if filmed else None
@@ -225,7 +225,9 @@ class Recordings:
 
     def _next(self) -> Path:
         remove_left_over(self._folder, _LOG)  # of sessions that were killed
-        written = (self._folder / SUMMARY).exists() or any(self._folder.glob(f".{_LOG}.*"))  # by another session
+        files = (SUMMARY, WEIGHTS, LIVE_LINK, ANIMATION)
+        written = any((self._folder / name).exists() for name in files)
+        written = written or any(self._folder.glob(f".{_LOG}.*"))  # by another session
         if self._folder not in self._begun and not written:
             return self._folder
         numbered = (self._folder / f"take_{number}" for number in range(2, _MAX_TAKES))

@@ -6,6 +6,7 @@ import copy
 import time
 from dataclasses import dataclass, field
 from pathlib import Path
+from shlex import quote
 from typing import Any
 
 import torch
@@ -58,8 +59,8 @@ _CONVERT = {
     ".fbx": "install Blender, blender.org, and let it write one with skeleton and shape keys: "
     'blender --background --python-expr "import bpy; bpy.ops.wm.read_factory_settings(use_empty=True); '
     "bpy.ops.import_scene.fbx(filepath='{path}'); bpy.ops.export_scene.gltf(filepath='{stem}.glb')\"",
-    ".gltf": "pack it: npx @gltf-transform/cli copy {path} {stem}.glb",
-    **dict.fromkeys(IMAGE_ENDINGS, "of photographs: torchface fit {path} --out {stem}.glb"),
+    ".gltf": "pack it: npx @gltf-transform/cli copy {quoted} {made}",
+    **dict.fromkeys(IMAGE_ENDINGS, "of photographs: torchface fit {quoted} --out {made}"),
 }
 
 
@@ -175,10 +176,11 @@ def check_character(path: Path) -> None:
     if ending not in CHARACTER_ENDINGS:
         if ending not in _CONVERT:
             check_there(path)
-        bare = f"a mesh alone gets them by: torchface arkit {path} --out {path.stem}.glb"
+        bare = f"a mesh alone gets them by: torchface arkit {quote(str(path))} --out {quote(path.stem + '.glb')}"
         converted = bare if ending in MESH_ENDINGS else "export it as .glb"
         # The output is named without the input's folder, which may be closed.
-        how = _CONVERT.get(ending, converted).format(path=path, stem=path.stem)
+        names = {"quoted": quote(str(path)), "made": quote(f"{path.stem}.glb")}
+        how = _CONVERT[ending].format(path=path, stem=path.stem, **names) if ending in _CONVERT else converted
         raise FileFormatError(
             f"{path}: found {ending!r}, expected a character's .glb, .vrm or USD ({how}), or --template for a scan"
         )

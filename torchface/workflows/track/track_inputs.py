@@ -3,6 +3,7 @@
 import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
+from shlex import quote
 from typing import Literal
 
 from torch import Tensor
@@ -152,9 +153,10 @@ def load_actor(rig: Path, part: str | None) -> BlendshapeRig:
     if count != 68:
         what = "no landmark vertices" if count == 0 else f"{count} landmark vertices"
         raise ValueRangeError(
-            f"{rig}: found {what}, expected the 68 of iBUG: torchface rig {rig} --out NEW{rig.suffix} finds them on a "
-            f"character's face, torchface pick takes them by hand; or track without --rig, and torchface retarget "
-            f"OUT/weights.csv --to {rig} --animation TAKE.glb carries the weights over"
+            f"{rig}: found {what}, expected the 68 of iBUG: torchface rig {quote(str(rig))} --out "
+            f"NEW{rig.suffix} finds them on a character's face, torchface pick takes them by hand; or track "
+            f"without --rig, and torchface retarget OUT/weights.csv --to {quote(str(rig))} --animation TAKE.glb "
+            "carries the weights over"
         )
     return actor
 

@@ -119,7 +119,7 @@ def fit_attachment(
     initial_points = motion.at(motion.points, initial)[..., 0]
     solver = SiteSolver(motion, SiteSearch(motion, initial), initial_points, standoff, scale)
     if not insist:
-        check_not_mirrored(paths, initial_points, str(rom.extras.get("source", "take")))
+        check_not_mirrored(paths, initial_points, str(rom.extras.get("source", "take")), rom.extras.get("flipped"))
     middle = paths.nanmedian(0).values
     pose = pose_of_points(middle, initial_points, scale)
     _check_motion(pose.apply(paths))
