@@ -317,10 +317,11 @@ def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path
     made = fit_photographs(
         [photograph], files, people.model, tmp_path / "rig.glb", PhotographSettings(fit=FitSettings(texture_size=0))
     )
-    assert len(made.remarks) == 1
-    assert "takeo.ppm: the given landmarks do not fit well" in made.remarks[0]
-    assert "those that landmark_network finds have" in made.remarks[0]
-    assert made.remarks[0] in made.lines()
+    assert len(made.remarks) == 2
+    assert "takeo.ppm: no colours" in made.remarks[0]
+    assert "takeo.ppm: the given landmarks do not fit well" in made.remarks[1]
+    assert "those that landmark_network finds have" in made.remarks[1]
+    assert made.remarks[1] in made.lines()
     fits = replace(made, fit=replace(made.fit, residuals=torch.zeros_like(made.fit.residuals)), remarks=())
     assert fits.verdict().startswith("result: good, eyes, nose and mouth lie 0.0%")
     eyes = replace(made, fit=replace(made.fit, iris=torch.full((3,), 0.25)))
@@ -342,6 +343,15 @@ def test_a_dark_photograph_makes_a_poor_result_and_a_name_that_says_so_does_not(
         save_image(light * photograph, tmp_path / name)
         made = fit_photographs([tmp_path / name], marks, None, tmp_path / "rig.glb", settings)
         assert made.verdict().startswith("result: poor, too dark to show") == poor, made.verdict()
+
+
+@pytest.mark.real
+def test_a_grey_photograph_is_warned_of_where_its_landmarks_are_given(data: Path, tmp_path: Path) -> None:
+    folder, settings = data / "images" / "people", PhotographSettings(fit=FitSettings(texture_size=0))
+    photograph, marks = load_image(folder / "lfpw_2.png"), [folder / "lfpw_2.pts"]
+    save_image(photograph.mean(0).expand(3, -1, -1).contiguous(), tmp_path / "a.png")
+    made = fit_photographs([tmp_path / "a.png"], marks, None, tmp_path / "rig.glb", settings)
+    assert any("no colours: the skin is grey" in line for line in made.remarks), made.remarks
 
 
 @pytest.mark.real

@@ -54,6 +54,7 @@ from torchface.workflows.fit.picture_checks import (
     color_lines,
     cover_lines,
     edge_lines,
+    grey_lines,
     light_lines,
     picture_lines,
     profile_lines,
@@ -231,7 +232,8 @@ def fit_photographs(
     whole = [one.face.landmarks for one in found] or marks
     for photograph, image, shown, points, every in zip(photographs, images, parts, marks, whole, strict=True):
         edge = edge_lines(photograph, (image.shape[2], image.shape[1]), every)
-        remarks += color_lines(photograph, image, shown, points) if found else []
+        # Given landmarks may lie off the face, where grain says nothing.
+        remarks += (color_lines if found else grey_lines)(photograph, image, shown, points)
         remarks += [*edge, *cover_lines(photograph, shown, points, bool(edge))]
         if not settings.everything:
             of_light, too_dark = light_lines(photograph, image, shown, points)

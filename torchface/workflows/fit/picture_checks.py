@@ -48,6 +48,7 @@ _GRID = 40
 _COVERS = {
     "glasses": (0.12, "dark glasses hide"), "hand": (0.06, "a hand hides"), "cloth": (0.10, "cloth (a mask?) hides"),
 }  # fmt: skip
+_NO_COLORS = "no colours: the skin is grey, and what it hides of the eyes' colour too"
 _PARTS = {"nose": slice(27, 36), "mouth": slice(48, 68)}
 
 
@@ -196,16 +197,32 @@ def _hidden_parts(found: PhotographLandmarks) -> dict[str, float]:
     return ({"eyes": eyes} if eyes < _EYE_HIDDEN else {}) | hidden
 
 
+def grey_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Tensor) -> list[str]:
+    """Whether the skin has no colours, for people to read."""
+    skin = _skin(image, parts, landmarks.double())
+    grey = skin.shape[1] >= _FEWEST and _is_grey(skin)
+    return [f"WARNING: {photograph.name}: {_NO_COLORS}"] if grey else []
+
+
+def _skin(image: Tensor, parts: FaceParts, marks: Tensor) -> Tensor:
+    """The colours of a face's skin, (3,P)."""
+    face = _inside(parts, marks)
+    crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), parts.transform, len(face)).double() / 255
+    return crop[:, face & (parts.of("skin") > _SURE)]
+
+
+def _is_grey(skin: Tensor) -> bool:
+    return float((skin.amax(0) - skin.amin(0)).mean()) < GREY
+
+
 def color_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Tensor) -> list[str]:
     """What colours and grain of the skin say against a photograph of a person, for people to read."""
     marks = landmarks.double()
-    face = _inside(parts, marks)
-    crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), parts.transform, len(face)).double() / 255
-    skin = crop[:, face & (parts.of("skin") > _SURE)]
+    skin = _skin(image, parts, marks)
     if skin.shape[1] < _FEWEST:
         return []
-    if float((skin.amax(0) - skin.amin(0)).mean()) < GREY:
-        lines = ["no colours: the skin is grey, and what it hides of the eyes' colour too"]
+    if _is_grey(skin):
+        lines = [_NO_COLORS]
         flat = _flat_share(image, marks)
         if flat > _FLAT_GREY:
             lines.insert(0, f"{flat:.0%} of the face without grain, which photographs have: a drawing, a statue?")
