@@ -1,0 +1,149 @@
+"""Two people, another photograph's landmarks, a dark or a grey picture: none passes without a word."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+
+from torchface import load_rig, zoo
+from torchface.errors import (
+    AlignmentError,
+)
+from torchface.geometry.cameras.pinhole import look_at
+from torchface.io import load_identity_modes
+from torchface.io.images.image_files import load_image, save_image
+from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images
+from torchface.rig import BlendshapeRig
+from torchface.synthetic import draw_identities, performer
+from torchface.workflows.fit.fit_checks import ALONE, one_person_lines
+from torchface.workflows.fit.fit_landmarks import landmarks_of
+from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs
+from torchface.workflows.named_heads import load_head_model, matching
+
+PEOPLE = ("einstein.jpg", "lfpw_1.png", "lfpw_2.png", "takeo.ppm")
+"""The second and third are one woman."""
+
+
+@dataclass(frozen=True, eq=False)
+class People:
+    """A model of people, and photographs with their landmarks."""
+
+    model: Path
+    photographs: list[Path]
+    heads: HeadModel
+    rig: BlendshapeRig
+
+    def remarks(self, *which: int, insist: bool = False) -> list[str]:
+        photographs = [self.photographs[i] for i in which]
+        marks = torch.stack(landmarks_of(photographs, [path.with_suffix(".pts") for path in photographs]))
+        sizes = [load_image(path).shape[:0:-1] for path in photographs]
+
+        def bare(points: Tensor, rows: list[int]) -> ImageFit:
+            return fit_images(self.heads, self.rig, points, [sizes[row] for row in rows], settings=ALONE)
+
+        alone = [bare(marks[i : i + 1], [i]) for i in range(len(marks))]
+        return one_person_lines(photographs, marks, alone, bare, insist)
+
+
+@pytest.fixture(scope="module")
+def people(data: Path, ict_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> People:
+    modes, rig = load_identity_modes(ict_folder, part="face"), load_rig(ict_folder, part="face")
+    sizes = modes.deltas.flatten(1).norm(dim=1)
+    heads = HeadModel.on(rig.neutral, MorphableModel(rig.vertices, modes.deltas / sizes[:, None, None], sizes), rig=rig)
+    model = tmp_path_factory.mktemp("models") / "people"
+    zoo.save_model(heads, model, zoo.ModelCard("MIT", "ICT", {}, "none"))
+    return People(model, [data / "images" / "people" / name for name in PEOPLE], heads, rig)
+
+
+@pytest.mark.bench
+@pytest.mark.real
+def test_two_people_do_not_merge_without_a_word(people: People, tmp_path: Path) -> None:
+    photographs, out = [people.photographs[0], people.photographs[3]], tmp_path / "rig.glb"
+    marks = [path.with_suffix(".pts") for path in photographs]
+    with pytest.raises(AlignmentError, match=r"shows another person than the rest.*einstein\.jpg [012]%, .*--insist"):
+        fit_photographs(photographs, marks, people.model, out)
+    assert not out.exists()
+    assert any("may show different people" in line for line in people.remarks(0, 3, insist=True))
+    for stranger in (0, 3):
+        for known in (1, 2):
+            assert any("may show different people" in line for line in people.remarks(stranger, known, insist=True))
+    assert people.remarks(1, 2) == []
+    with pytest.raises(AlignmentError, match=r"einstein\.jpg: shows another person"):
+        people.remarks(0, 1, 2)
+
+
+@pytest.mark.bench
+@pytest.mark.real
+def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path) -> None:
+    photograph = people.photographs[3]
+    files = [photograph.with_suffix(".pts")]
+    made = fit_photographs(
+        [photograph], files, people.model, tmp_path / "rig.glb", PhotographSettings(fit=FitSettings(texture_size=0))
+    )
+    assert len(made.remarks) == 2
+    assert "takeo.ppm: no colours" in made.remarks[0]
+    assert "takeo.ppm: the given landmarks do not fit well" in made.remarks[1]
+    assert "those that landmark_network finds have" in made.remarks[1]
+    assert made.remarks[1] in made.lines()
+    fits = replace(made, fit=replace(made.fit, residuals=torch.zeros_like(made.fit.residuals)), remarks=())
+    assert fits.verdict().startswith("result: good, eyes, nose and mouth lie 0.0%")
+    eyes = replace(made, fit=replace(made.fit, iris=torch.full((3,), 0.25)))
+    assert "irises: #404040, their brightness in the photographs, which show no colours" in eyes.lines()
+    assert "irises: #404040, their colour in the photographs" in replace(eyes, grey=False).lines()
+    warned = replace(fits, remarks=("WARNING: takeo.ppm: the mouth hidden", "note: dark"))
+    assert warned.verdict().startswith("result: partly usable")
+    assert "; 1 warning below; " in warned.verdict()
+    assert replace(fits, dark=True).verdict().startswith("result: poor, too dark to show the skin's colour")
+    named = replace(fits, remarks=("WARNING: too dark room.jpg: the mouth hidden",))
+    assert named.verdict().startswith("result: partly usable")
+
+
+@pytest.mark.real
+def test_a_dark_photograph_makes_a_poor_result_and_a_name_that_says_so_does_not(data: Path, tmp_path: Path) -> None:
+    folder, settings = data / "images" / "people", PhotographSettings(fit=FitSettings(texture_size=0))
+    photograph, marks = load_image(folder / "lfpw_2.png"), [folder / "lfpw_2.pts"]
+    for name, light, poor in (("too dark room.png", 1.0, False), ("a.png", 0.2, True)):
+        save_image(light * photograph, tmp_path / name)
+        made = fit_photographs([tmp_path / name], marks, None, tmp_path / "rig.glb", settings)
+        assert made.verdict().startswith("result: poor, too dark to show") == poor, made.verdict()
+
+
+@pytest.mark.real
+def test_a_grey_photograph_is_warned_of_where_its_landmarks_are_given(data: Path, tmp_path: Path) -> None:
+    folder, settings = data / "images" / "people", PhotographSettings(fit=FitSettings(texture_size=0))
+    photograph, marks = load_image(folder / "lfpw_2.png"), [folder / "lfpw_2.pts"]
+    save_image(photograph.mean(0).expand(3, -1, -1).contiguous(), tmp_path / "a.png")
+    made = fit_photographs([tmp_path / "a.png"], marks, None, tmp_path / "rig.glb", settings)
+    assert any("no colours: the skin is grey" in line for line in made.remarks), made.remarks
+
+
+@pytest.mark.real
+def test_landmarks_of_another_photograph_make_a_poor_result(data: Path, tmp_path: Path) -> None:
+    folder, settings = data / "images" / "people", PhotographSettings(fit=FitSettings(texture_size=0))
+    made = fit_photographs([folder / "lfpw_1.png"], [folder / "lfpw_2.pts"], None, tmp_path / "rig.glb", settings)
+    assert made.verdict().startswith("result: poor, the given landmarks are not on a face"), made.verdict()
+    (line,) = made.remarks
+    assert line.startswith("WARNING: lfpw_1.png: the given landmarks do not fit well")
+    assert "expected less than 4.5%; landmark_network finds no face where the given landmarks lie" in line
+    made = fit_photographs([folder / "lfpw_2.png"], [folder / "lfpw_1.pts"], None, tmp_path / "rig.glb", settings)
+    assert made.verdict().startswith("result: poor, the given landmarks are not on a face")
+    assert "no face where the given landmarks lie, but 1 elsewhere" in " ".join(made.remarks)
+
+
+def test_exact_landmarks_of_one_head_are_of_one_person() -> None:
+    """As of a rendered head: what is left over is the model's form of it, and says nothing of another person."""
+    heads, rig = matching(load_head_model("head"))
+    person = performer(draw_identities(1, torch.Generator().manual_seed(3))[0], texture=False)
+    smile = torch.zeros(1, len(person.names))
+    smile[:, person.index(["mouthSmileLeft", "mouthSmileRight"])] = 0.7
+    points = person(smile)[0][person.neutral.landmarks]
+    cameras = [look_at(points.mean(0), yaw, span=300.0, width=464, height=580) for yaw in (-35.0, 0.0, 35.0)]
+    marks = torch.stack([camera.project(points.double()) for camera in cameras])
+
+    def bare(some: Tensor, rows: list[int]) -> ImageFit:
+        return fit_images(heads, rig, some, [(464, 580)] * len(rows), settings=ALONE)
+
+    alone = [bare(marks[i : i + 1], [i]) for i in range(3)]
+    assert one_person_lines([Path(f"{i}.png") for i in range(3)], marks, alone, bare) == []
