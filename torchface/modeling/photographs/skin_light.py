@@ -34,7 +34,7 @@ _SURE, _DARKEST = 0.5, 0.02
 # shade there: in 9 good photographs 0.31 to 0.66, in 4 dim ones 0.09 to 0.20.
 _WHITE, _FAIR, _EYE_WHITE = 0.91, 0.36, 0.3
 _BRIGHTEST, _EYE = 0.99, 0.95  # quantiles
-_BRIGHTER = 5.0  # at most: in what is darker, colours are hardly told from noise
+_BRIGHTER = 5.0  # at most: what is darker shows noise beside its colours
 _GLINT = 8.0  # times as bright as skin: no white of an eye is, but light in glasses
 _EYE_PIXELS = 10  # of the crop
 

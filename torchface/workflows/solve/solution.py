@@ -277,7 +277,7 @@ def _aligned(rig: BlendshapeRig, attachment: Attachment, take: Take, settings: S
     Where such a head turns, its markers' mean places are those of a smaller face: its scale is that of each frame.
     """
     found = align_take(rig, attachment, take, settings.neutral, settings.insist, settings.free_scale)
-    if not (settings.slip and settings.free_scale):
+    if not (settings.slip and settings.free_scale) or settings.neutral is not None:
         return found
     assert take.markers is not None
     solver = MarkerSolver(rig, attachment)
