@@ -102,7 +102,7 @@ def transfer_deformation(
     Raises:
         TopologyError: source and target have other triangles, or none.
         AlignmentError: the target is a mirror image, or its vertices stand in another order: more than 5 % of its edges
-            are over five times as long as the source's, or all or half of them are shifted by up to three places.
+            are over five times as long as the source's, or a sixteenth of them or more are shifted.
         ValueRangeError: the source has no shapes, the target has collapsed or another unit, or the weight is negative.
 
     Source: thesis 3.3.1; Sumner and Popovic 2004.
