@@ -2,7 +2,9 @@
 
 import torch
 
-from torchface.modeling.photographs.hair_cap import HairCap, _leaves, without_veil
+from torchface.landmarks.images.networks.part_finder import FaceParts
+from torchface.landmarks.images.networks.part_network import PARTS
+from torchface.modeling.photographs.hair_cap import HairCap, _leaves, _white_hair, without_veil
 from torchface.modeling.photographs.skin_mask import FacePlaces
 from torchface.synthetic import neutral_head
 
@@ -45,3 +47,32 @@ def test_patches_beside_green_are_leaves_and_whole_hair_before_a_green_wall_is_h
     assert _leaves(green, patches, skin)
     assert not _leaves(green, whole, skin)
     assert not _leaves(green.mean(0, keepdim=True).expand(3, 40, 40), patches, skin)
+
+
+def test_hair_grows_thin_toward_an_uneven_edge() -> None:
+    places = FacePlaces.of(neutral_head(texture=False))
+    across, up = torch.linspace(-0.4, 0.4, 161, dtype=torch.float64), torch.linspace(0.3, 0.9, 601, dtype=torch.float64)
+    x, y = torch.meshgrid(across, up, indexing="ij")
+    at = torch.stack([x, y, torch.full_like(x, float(places.ears) + 1.0)], dim=-1)
+    cap = HairCap(torch.full((3,), 0.3), torch.full((17,), 0.6, dtype=torch.float64), places)
+    share = cap.share(at.flatten(0, 1)).view_as(x)
+    assert float(share[:, up < 0.4].max()) == 0
+    assert float(share[:, up > 0.8].min()) > 0.95
+    step = up[1] - up[0]
+    begins, ends = (((share < limit) * step).sum(1) for limit in (0.1, 0.9))
+    assert float((ends - begins).mean()) > 0.05  # 5 mm from the last strands to whole hair
+    assert float(begins.std()) > 0.015
+
+
+def test_white_hair_off_the_head_that_the_network_takes_for_skin_is_hair_and_a_face_behind_is_none() -> None:
+    shares = torch.zeros(len(PARTS), 60, 60)
+    shares[PARTS.index("hair")], shares[PARTS.index("skin")] = 0.3, 0.6
+    shown = FaceParts(shares, torch.eye(2, 3, dtype=torch.float64))
+    head = torch.tensor([[20.0, 20.0], [40.0, 20.0], [40.0, 50.0], [20.0, 50.0]])
+    white, skin = (
+        torch.tensor(color)[:, None, None].expand(3, 60, 60) for color in ((0.7, 0.7, 0.68), (0.7, 0.5, 0.4))
+    )
+    found = _white_hair(shown, white, head)
+    assert float(found[10, 10]) > 0.8
+    assert float(found[30, 30]) == 0
+    assert float(_white_hair(shown, skin, head).max()) == 0

@@ -1,5 +1,6 @@
 """Light planted on a head's skin is found in its picture and divided out of its colours."""
 
+import math
 from dataclasses import replace
 
 import pytest
@@ -161,6 +162,26 @@ def test_even_skin_stays_as_it_is(head: Mesh) -> None:
     assert float(patch_offset(blush, cheeks, None, graph)[cheeks > 0].abs().max()) < 0.03
     darker = 0.3 * head.colors  # one complexion may be darker than another all over
     assert float(patch_offset(darker, cheeks, head.colors, graph)[cheeks > 0].abs().max()) < 1e-3
+
+
+def test_a_coloured_light_is_taken_off_where_there_is_no_colour_model_and_grey_stays_grey(
+    head: Mesh, camera: Camera
+) -> None:
+    plain, places = replace(head, colors=None), FacePlaces.of(head)
+    picture = render(head, camera, lighting=EVEN, samples=1)
+    tinted = {
+        "orange": picture * torch.tensor([1.0, 0.8, 0.5])[:, None, None],
+        "grey": picture.mean(0).expand(3, -1, -1),
+    }
+    hues = {}
+    for name, image in tinted.items():
+        parts = planted_parts(image, {"background": torch.zeros(3)}, 0.05)
+        skin = photographed_skin([plain], None, [image], [camera], FitSettings(texture_size=64, parts=[parts]))
+        color = skin.colors[places.cheeks & ~part_vertices(head)].median(0).values
+        hues[name] = float((color[0] / color[2]).log())
+    own = float((SKIN[0] / SKIN[2]).log())
+    assert own < hues["orange"] < own + 0.6 * math.log(2)  # people's skins differ in hue by the rest
+    assert abs(hues["grey"]) < 0.01
 
 
 def test_hue_of_a_coloured_light_beyond_peoples_skins_is_found(head: Mesh) -> None:

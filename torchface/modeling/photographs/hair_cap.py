@@ -23,13 +23,19 @@ _BEHIND, _NAPE = (0.54, 0.74), -0.75
 _LONG_BEHIND, _LONG_NAPE = (0.48, 0.66), -1.5
 _EDGE, _FRINGE = 0.08, 0.07
 _ABOVE_BROWS, _SQUARE, _HAIR = 0.06, 0.3, 0.5
+_DEEP, _SHARPLY = 5.0, 2  # pixels of the crop within hair, and the power with which they count
+_WHITE, _UNSURE = 0.1, 0.1  # of its brightness, by which the channels of white hair differ at most; its share
 _LEAST, _SHARE = 20, 0.3
 _DARKEST, _BLACK = 0.005, 0.07  # the share of a head's pixels that is black, and its usual value in photographs
 _BEYOND, _MIDDLE = 0.2, 0.35  # share of hair in a picture above the brows, there about the face's middle
 # Of full white; shares: of hair in wide patches (leaves 0.53, hair at least 0.70), of what is green beside them.
 _GREEN, _PATCHY, _LEAFY = 0.008, 0.62, 0.2
 _COLUMNS, _COLUMN, _FEW = 17, 0.05, 6  # across the forehead, half the width of each, vertices
-_STRANDS, _STRAND = 150.0, 0.10
+# Widths (radians about the crown's axis) and lengths of strands and of locks, the band over which hair grows thin, how
+# uneven its edge is in that, and by how much strands differ in brightness.
+_STEP = 0.03  # over which the slope of the line is taken
+_STRANDS, _LOCKS = (0.02, 0.25), (0.13, 0.4)
+_THIN, _RAGGED, _CONTRAST = 0.26, 0.5, 0.35
 # In distances between the eyes' outer corners: how far from the face's middle hair hangs beside the neck, and how far
 # below the mouth.
 _BESIDE, _BELOW = (0.55, 1.15), (0.15, 0.75)
@@ -50,61 +56,78 @@ class HairCap:
     def share(self, place: Tensor) -> Tensor:
         """How much hair covers points (Q,) at places (Q,3)."""
         y, behind = place[:, 1], self.places.ears - place[:, 2]
-        column = (place[:, 0] / _TEMPLE).clamp(-1, 1) * ((_COLUMNS - 1) // 2) + (_COLUMNS - 1) // 2
+        line, before, after = (self._line(place[:, 0], behind + step) for step in (0.0, -_STEP, _STEP))
+        beyond = (y - line) / (1 + ((after - before) / (2 * _STEP)).square()).sqrt()
+        # Hair grows thinner toward its edge, in locks of uneven length, until single strands are left on the skin.
+        locks = _noise(self._way(place, *_LOCKS)) - 0.5
+        thick = beyond / _THIN + _RAGGED * locks + 0.5
+        strand = _noise(self._way(place, *_STRANDS))
+        return _ramp(thick, 0.0, 1.0) * _ramp(thick + strand - 0.5, 0.0, 0.8)
+
+    def _line(self, across: Tensor, behind: Tensor) -> Tensor:
+        """How high hair begins at places (Q,) across the face and behind the ears' front, (Q,)."""
+        column = (across / _TEMPLE).clamp(-1, 1) * ((_COLUMNS - 1) // 2) + (_COLUMNS - 1) // 2
         left = column.floor().long().clamp(max=_COLUMNS - 2)
         line = torch.lerp(self.line[left], self.line[left + 1], column - left)
         line = torch.lerp(line, torch.full_like(line, _SIDEBURN), _ramp(behind, *_SIDES))
         line = torch.lerp(line, torch.full_like(line, _OVER_EARS), _ramp(behind, *_EAR))
         where, low = (_LONG_BEHIND, _LONG_NAPE) if self.long else (_BEHIND, _NAPE)
-        line = torch.lerp(line, torch.full_like(line, low), _ramp(behind, *where))
-        # Single strands reach farther; locks of a few make the edge uneven.
-        wave = 0.01 * (torch.sin(23 * place[:, 0]) + torch.sin(37 * place[:, 0] + 1.3)) + 0.3 * _EDGE * self._strands(
-            place
-        )
-        return _ramp(y - line + wave, -_EDGE, _EDGE)
+        return torch.lerp(line, torch.full_like(line, low), _ramp(behind, *where))
 
     def painted(self, colors: Tensor, place: Tensor, share: Tensor) -> Tensor:
         """Colours (Q,3) with the hair over them, in strands that hang down."""
-        hair = self.color.to(colors) * (1 + _STRAND / 2 * self._strands(place)[:, None]).to(colors)
+        light = _noise(self._way(place, *_STRANDS)) + _noise(self._way(place, *_LOCKS)) - 1.0
+        hair = self.color.to(colors) * (1 + _CONTRAST * light[:, None]).to(colors)
         return torch.lerp(colors, hair.clamp(0, 1), share[:, None].to(colors))
 
-    def _strands(self, place: Tensor) -> Tensor:
-        """Light and dark of single strands at places (Q,3), (Q,) in [-2,2]."""
+    def _way(self, place: Tensor, across: float, along: float) -> Tensor:
+        """Places (Q,3) across and along the hair, which hangs down from the crown, in widths and lengths, (Q,2)."""
         around = torch.atan2(place[:, 0], place[:, 2] - self.places.ears)
-        return torch.sin(_STRANDS * around + 3 * torch.sin(7 * place[:, 1])) + torch.sin(2.3 * _STRANDS * around)
+        return torch.stack([around / across, place[:, 1] / along], dim=1)
+
+
+def _noise(at: Tensor) -> Tensor:
+    """Uneven values in [0,1] at places (Q,2), smooth over about 1."""
+    cell = at.floor()
+    share = at - cell
+    share = share * share * (3 - 2 * share)
+    values = [
+        (43758.5453 * torch.sin((cell + cell.new_tensor(corner)) @ cell.new_tensor([12.9898, 78.233]))) % 1
+        for corner in ((0, 0), (1, 0), (0, 1), (1, 1))
+    ]
+    low, high = (torch.lerp(values[k], values[k + 1], share[:, 0]) for k in (0, 2))
+    return torch.lerp(low, high, share[:, 1])
 
 
 def hair_cap(
     images: Sequence[Tensor],
     parts: Sequence[FaceParts],
+    heads: Sequence[Tensor],
     marks: Sequence[Tensor],
     shown: Sequence[Shown],
     places: Sequence[FacePlaces],
     hair: Tensor,
 ) -> HairCap | None:
-    """The hair (I,V), see ``ShownParts``, that photographs (3,H,W) with landmarks (68,2) show above the brows, on the
-    head that was found or off it; None without.
+    """The hair (I,V), see ``ShownParts``, that photographs (3,H,W) with heads (V,2) and landmarks (68,2) show above the
+    brows, on the head that was found or off it; None without.
     """
-    place, covered, colors = _over_brows(shown, places, hair)
+    place, covered = _over_brows(shown, places, hair)
     high = place[:, 1] > _HAIRLINE - _FALL
-    if int((covered & high).sum()) >= max(_LEAST, _SHARE * int(high.sum())):
-        color: Tensor | None = colors[covered & high].median(0).values.float()
-    else:
-        color = _hair_beyond(images, parts, marks)
+    on_head = int((covered & high).sum()) >= max(_LEAST, _SHARE * int(high.sum()))
+    color = _hair_color(images, parts, heads, marks, on_head)
     if color is None:
         return None
     return HairCap(color, _hairline(place, covered), places[0], hangs_down(parts, torch.stack(list(marks))))
 
 
-def _over_brows(shown: Sequence[Shown], places: Sequence[FacePlaces], hair: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Places (Q,2), whether there is hair (Q,), and colours (Q,3) of what photographs show above the brows."""
-    at, found, colors = list[Tensor](), list[Tensor](), list[Tensor]()
+def _over_brows(shown: Sequence[Shown], places: Sequence[FacePlaces], hair: Tensor) -> tuple[Tensor, Tensor]:
+    """Places (Q,2) that photographs show above the brows, and whether there is hair (Q,)."""
+    at, found = list[Tensor](), list[Tensor]()
     for one, where, share in zip(shown, places, hair, strict=True):
         seen = (one.cosine > _SQUARE) & (where.place[:, 1] > where.brows + _ABOVE_BROWS) & (where.behind < _SIDES[0])
         at.append(where.place[seen, :2])
         found.append(share[seen] > _HAIR)
-        colors.append(one.colors[seen].double())
-    return torch.cat(at), torch.cat(found), torch.cat(colors)
+    return torch.cat(at), torch.cat(found)
 
 
 def _hairline(place: Tensor, covered: Tensor) -> Tensor:
@@ -119,22 +142,49 @@ def _hairline(place: Tensor, covered: Tensor) -> Tensor:
     return around(around(line).median(1).values).mean(1)
 
 
-def _hair_beyond(images: Sequence[Tensor], parts: Sequence[FaceParts], marks: Sequence[Tensor]) -> Tensor | None:
-    """The colour (3,) of hair above the brows and off the head that was found, such as a shock of it; None without."""
-    colors = []
-    for image, shown, points in zip(images, parts, marks, strict=True):
+def _hair_color(
+    images: Sequence[Tensor],
+    parts: Sequence[FaceParts],
+    heads: Sequence[Tensor],
+    marks: Sequence[Tensor],
+    on_head: bool,
+) -> Tensor | None:
+    """The mean colour (3,) of hair above the brows, in its light and shade; None without.
+
+    Where none is seen on the head that was found, it may stand off it, such as a shock of it.
+    """
+    colors, weights = [], []
+    for image, shown, head, points in zip(images, parts, heads, marks, strict=True):
         size, transform = shown.shares.shape[-1], shown.transform
         crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), transform, size).float() / 255
         at = points.double() @ transform[:, :2].T + transform[:, 2]
         top = int(at[17:27, 1].amin().clamp(0, size))
-        hair = shown.of("hair")[:top] > _HAIR
+        share = torch.maximum(shown.of("hair"), _white_hair(shown, crop, head))[:top].double()
+        hair, crop = share > _HAIR, crop[:, :top]
         middle = (torch.arange(size) - at[36:48, 0].mean()).abs() / (at[45] - at[36]).norm() < _MIDDLE
-        share = hair[:, middle].double().mean() if hair.numel() else torch.zeros(())
-        if float(share) > _BEYOND and not _leaves(
-            crop[:, :top, middle], hair[:, middle], shown.of("skin")[:top, middle]
+        seen = hair[:, middle].double().mean() if hair.numel() else torch.zeros(())
+        if on_head or (
+            float(seen) > _BEYOND and not _leaves(crop[..., middle], hair[:, middle], shown.of("skin")[:top, middle])
         ):
-            colors.append(crop[:, :top][:, hair])
-    return torch.cat(colors, 1).median(1).values if colors else None
+            # The border of hair is mixed with what stands behind it and with skin.
+            inside = (_grown(shown, points, share) * hair).byte().numpy()
+            weight = (
+                torch.from_numpy(cv2.distanceTransform(inside, cv2.DIST_L2, 3)).clamp(max=_DEEP).double().pow(_SHARPLY)
+            )
+            colors.append(crop.double().flatten(1) @ weight.flatten())
+            weights.append(weight.sum())
+    total = torch.stack(weights).sum() if weights else torch.zeros(())
+    return (torch.stack(colors).sum(0) / total).float() if float(total) >= _LEAST else None
+
+
+def _white_hair(shown: FaceParts, crop: Tensor, head: Tensor) -> Tensor:
+    """How surely pixels of a crop (3,S,S) show white hair off a head at (V,2), (S,S): the network takes it
+    rather for skin, which has a hue and is on the head."""
+    at = head.double() @ shown.transform[:, :2].T + shown.transform[:, 2]
+    outline = cv2.convexHull(at.round().int().numpy())
+    inside = torch.from_numpy(cv2.fillConvexPoly(np.zeros(crop.shape[1:], np.uint8), outline, 1)).bool()
+    grey = crop.amax(0) - crop.amin(0) < _WHITE * crop.mean(0)
+    return shown.of("hair", "skin") * (grey & ~inside & (shown.of("hair") > _UNSURE))
 
 
 def _leaves(crop: Tensor, hair: Tensor, skin: Tensor) -> bool:
@@ -157,7 +207,7 @@ def hangs_down(parts: Sequence[FaceParts], marks: Tensor) -> bool:
         sides = torch.linspace(*_BESIDE, 9, dtype=torch.float64)
         below = torch.linspace(*_BELOW, 9, dtype=torch.float64)
         mouth = points[48:].nanmean(0)
-        grown = replace(shown, shares=shown.shares * _grown(shown, points))
+        grown = replace(shown, shares=shown.shares * _grown(shown, points, shown.of("hair")))
         left, right = (
             grown.at(mouth + side * sides[:, None, None] * unit + below[:, None] * down, "hair").nanmean().nan_to_num(0)
             for side in (-1, 1)
@@ -169,12 +219,13 @@ def hangs_down(parts: Sequence[FaceParts], marks: Tensor) -> bool:
     return float(torch.stack(found).median()) > _LONG
 
 
-def _grown(shown: FaceParts, points: Tensor) -> Tensor:
-    """Which pixels (S,S) of a crop belong to hair that is one with hair over the brows' middle, landmarks (68,2).
+def _grown(shown: FaceParts, points: Tensor, share: Tensor) -> Tensor:
+    """Which pixels of a crop's upper rows, (H,S), belong to hair, in shares (H,S), that is one with hair over the
+    brows' middle, landmarks (68,2).
 
     What reaches over them beside the head alone is a curtain or a wall.
     """
-    hair = cv2.erode((shown.of("hair") > _HAIR).numpy().astype(np.uint8), np.ones((3, 3), np.uint8))
+    hair = cv2.erode((share > _HAIR).numpy().astype(np.uint8), np.ones((3, 3), np.uint8))
     _, label = cv2.connectedComponents(hair, connectivity=4)
     brows = points[17:27] @ shown.transform[:, :2].T + shown.transform[:, 2]
     high = int(brows[:, 1].nan_to_num(0.0).amin().clamp(0, len(label)))

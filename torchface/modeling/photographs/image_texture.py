@@ -47,6 +47,7 @@ _LID_SHADOW = 0.5  # of the eye's opening
 _TONE, _SEAM = 40, 16  # rounds over the mesh: the skin around, and the band in which what is completed begins
 _EVEN = 0.04, 0.10  # of a skin's brightness: what is added to it against shadows in even light at most, in shadows
 _DARK = 0.02  # of full white
+_SKIN = (0.74, 0.46, 0.41)  # whose hue the light of photographs is judged by where no colour model is: that of `head`
 # Logarithms by which a place of skin differs from the skin around it, in brightness and hue: strands of hair, and folds
 # in shadow differ more.
 _FOLDS, _PORES, _FRAMED_SKIN = (0.8, 0.12), (0.2, 0.06), (0.06, 0.04)
@@ -126,7 +127,9 @@ def photographed_skin(
         if parts is not None:
             mirror = None if mesh.annotations is None else mesh.annotations.mirror
             odd = _filtered(views)
-            views = [_without_patches(view, base, graph, others, mirror) for view in views]
+            grey = without_colors(images)
+            usual = mesh.vertices.new_tensor(_SKIN).cpu().expand(len(others), 3) if base is None and not grey else base
+            views = [_without_patches(view, usual, graph, others, mirror) for view in views]
             images, patches = [view.image for view in views], [view.patch for view in views]
             places = [view.places for view in views]
             confidence = torch.stack([view.parts.own * _like_skin(view, graph) for view in views])
@@ -137,7 +140,7 @@ def photographed_skin(
             hair = torch.where(others, 0.0, torch.stack([view.parts.hair for view in views]))
             pixels = [view.camera.project(view.surface.vertices) for view in views]
             marks = [one[mesh.landmarks.cpu()] for one in pixels]
-            cap = hair_cap(images, parts, marks, [view.shown for view in views], places, hair)
+            cap = hair_cap(images, parts, pixels, marks, [view.shown for view in views], places, hair)
             bare = torch.cat([view.shown.colors[view.parts.bare > _BARE] for view in views])
             if cap is not None and len(bare):
                 cap = replace(cap, color=without_veil(cap.color, bare.median(0).values, images, pixels))
