@@ -105,6 +105,20 @@ def test_errors_along_the_contour_count_as_in_the_solve(small: BlendshapeRig) ->
         torch.testing.assert_close(errors, torch.full_like(errors, counted * 10 / 68**0.5), atol=1e-3, rtol=0)
 
 
+def test_a_landmark_counts_in_the_error_as_much_as_it_is_trusted(small: BlendshapeRig) -> None:
+    """One behind a hand lies anywhere."""
+    rotation, translation = poses(2)
+    weights = acted(2)
+    moved, solver = film(small, weights, rotation, translation), exact(small)
+    moved[:, 30] += torch.tensor([6.0, 8.0])
+    for trust in (1.0, 0.1, 0.0):
+        confidence = torch.ones(2, 68)
+        confidence[:, 30] = trust
+        errors = solver.reprojection_errors(moved, weights, rotation, translation, confidence)
+        expected = 10 * (trust / (67 + trust)) ** 0.5
+        torch.testing.assert_close(errors, torch.full_like(errors, expected), atol=1e-3, rtol=0)
+
+
 def test_landmarks_that_are_not_seen_are_skipped(small: BlendshapeRig) -> None:
     rotation, translation = poses(3)
     weights = acted(3)

@@ -208,6 +208,35 @@ def test_anamorphic_pixels_become_square(aspect: Fraction, ending: str, tmp_path
         assert abs(int(disc.any(1).sum()) - 40) <= 2
 
 
+def moving_disc(number: float) -> np.ndarray:
+    """A soft white disc (96,128,3) that moves by 6 pixels a frame."""
+    y, x = np.mgrid[:96, :128]
+    edge = np.hypot(x - 30 - 6 * number, y - 48) - 20
+    return np.repeat((255 / (1 + np.exp(edge / 2))).astype(np.uint8)[..., None], 3, -1)
+
+
+@pytest.mark.parametrize(("codec", "ending"), [("libx264", "mp4"), ("mpeg2video", "mkv")])
+def test_frames_of_two_fields_become_whole(codec: str, ending: str, tmp_path: Path) -> None:
+    """Each is of the time of its first field, the lower one here; what the other shows lies three pixels further on."""
+    path = tmp_path / f"fields.{ending}"
+    with av.open(str(path), "w") as container:
+        stream = container.add_stream(codec, rate=25, options={"flags": "+ilme+ildct", "b": "8000000"})
+        stream.width, stream.height, stream.pix_fmt = 128, 96, "yuv420p"
+        for number in range(8):
+            woven = moving_disc(number)
+            woven[::2] = moving_disc(number + 0.5)[::2]
+            container.mux(stream.encode(av.VideoFrame.from_ndarray(woven, "rgb24")))
+        container.mux(stream.encode(None))
+    video = open_video(path)
+    frames = torch.cat(list(video.color_chunks())).numpy().transpose(0, 2, 3, 1).astype(float)
+    with av.open(str(path)) as container:
+        woven = np.stack([frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]).astype(float)
+    true = np.stack([moving_disc(number) for number in range(8)])
+    assert video.interlaced
+    assert len(frames) == len(woven) == 8
+    assert np.abs(frames - true).mean() < 0.35 * np.abs(woven - true).mean()
+
+
 def test_pixels_of_an_absurd_aspect_are_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"found pixels 6 times as wide as high, expected 0.25 to 4"):
         open_video(squeezed(tmp_path / "film.mkv", Fraction(6)))

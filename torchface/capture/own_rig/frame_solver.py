@@ -148,11 +148,19 @@ class FrameSolver(VideoSolverParts):
         x = attach_gradients(gradient, x, (x > self.lower) & (x < self.upper))
         return head.moved(x[:, :-6], x[:, -6:])
 
-    def reprojection_errors(self, landmarks: Tensor, weights: Tensor, rotation: Tensor, translation: Tensor) -> Tensor:
+    def reprojection_errors(
+        self,
+        landmarks: Tensor,
+        weights: Tensor,
+        rotation: Tensor,
+        translation: Tensor,
+        confidence: Tensor | None = None,
+    ) -> Tensor:
         """Root mean square distance of seen landmarks (T,68,2) to the rig's, (T,), pixels; NaN where none is seen.
 
-        Landmarks of the contour count along it as they do in the solve, see ``sliding``: where between ear and chin an
-        annotator sets them says nothing of a face.
+        Each counts as much as its confidence (T,68), so one behind a hand does not. Landmarks of the contour count
+        along it as they do in the solve, see ``sliding``: where between ear and chin an annotator sets them says
+        nothing of a face.
         """
         weights, rotation, translation = (x.detach().double() for x in (weights, rotation, translation))
         points, K = self.points, self.intrinsics.double()
@@ -161,5 +169,6 @@ class FrameSolver(VideoSolverParts):
         image = (placed @ rotation.transpose(-1, -2) + translation[:, None]) @ K.T
         pixels = image[..., :2] / image[..., 2:]
         off = sliding((pixels - landmarks.detach().double())[..., None], pixels, self.settings.contour_slide)
-        squared = off.square().sum((-2, -1))
-        return squared.nanmean(1).sqrt().to(landmarks.dtype)
+        trust = self.landmark_trust(landmarks, confidence)
+        squared = (trust * off.square().sum((-2, -1)).nan_to_num(0.0)).sum(1)
+        return (squared / trust.sum(1)).sqrt().to(landmarks.dtype)

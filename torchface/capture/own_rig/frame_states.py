@@ -19,7 +19,8 @@ class VideoSolution:
         weights: in [0,1], (T,N).
         rotation: rig to camera, refined with the weights, (T,3,3).
         translation: rig to camera, (T,3), millimetres.
-        errors: root mean square distance of the seen landmarks to the rig's, (T,), pixels; NaN where none is seen.
+        errors: root mean square distance of the landmarks to the rig's, each counted as much as it is trusted, (T,),
+            pixels; NaN where none is seen.
         solved: frames with at least six landmarks, (T,) bool; the others keep the weights of the frame before,
             or in a whole take lie between those before and after.
         confidence: share of what shows each weight that was seen, (T,N) in [0,1].

@@ -133,7 +133,7 @@ class VideoSolver(FrameSolver):
             landmarks, confidence, measured: as of ``forward``.
             weights, rotation, translation: as solved.
         """
-        errors = self.reprojection_errors(landmarks, weights, rotation, translation)
+        errors = self.reprojection_errors(landmarks, weights, rotation, translation, confidence)
         views = () if measured is None else measured.views
         seen = self.shape_confidence(self.landmark_trust(landmarks, confidence, views)).to(landmarks.dtype)
         solved = self.shows_face(landmarks, confidence, views)

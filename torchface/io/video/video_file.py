@@ -16,6 +16,7 @@ from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.tables.frame_rates import COMMON_RATES
 from torchface.io.video.video_packets import (
     frames_beside,
+    is_interlaced,
     key_frame_sizes,
     open_container,
     packets_of,
@@ -24,11 +25,13 @@ from torchface.io.video.video_packets import (
     read_packets,
     reason,
     square_size,
+    without_fields,
 )
 from torchface.number_checks import check_rate
 
 if TYPE_CHECKING:
     from av.container import InputContainer
+    from av.video.frame import VideoFrame
     from av.video.stream import VideoStream
 
 VIDEO_ENDINGS = (".avi", ".mkv", ".webm", ".mp4", ".mov", ".gif")
@@ -56,6 +59,7 @@ class VideoFile:
         count: frames that are shown; of a file that is cut off, those its header promises.
         even: whether frames must come at an even rate; else what reads them asks ``uneven_seconds`` when they come.
         pixel_aspect: how many times as wide as high the stored pixels are.
+        interlaced: whether the header says that frames are stored as two fields; those that are given are whole.
 
     Example:
         >>> from torchface.io.video import write_video
@@ -71,6 +75,7 @@ class VideoFile:
     count: int
     even: bool = True
     pixel_aspect: float = 1.0
+    interlaced: bool = False
 
     def uneven_seconds(self) -> tuple[Tensor | None, str]:
         """When each frame is shown, (count,) float64 from 0, and how the rate varies; None where it is even.
@@ -214,31 +219,40 @@ def open_video(path: str | Path) -> VideoFile:
             raise FileFormatError(
                 f"{path}: no frame can be decoded{''.join(errors[:1])}; expected a video of a codec that FFmpeg knows"
             )
-        aspect = float(stream.sample_aspect_ratio or 1)
+        aspect, fields = float(stream.sample_aspect_ratio or 1), is_interlaced(stream)
         declared = stream.frames or round((container.duration or 0) / pyav().time_base * fps)
     whole = len(packets.seconds) + packets.hidden >= 0.99 * declared - 1
     count = len(packets.seconds) if whole else declared - packets.hidden
     if not 1 <= count <= _MAX_FRAMES:
         raise FileFormatError(f"{path}: its header says {count} frames, expected a positive number")
-    return VideoFile(path, fps, frame.shape[1], frame.shape[0], count, pixel_aspect=aspect)
+    return VideoFile(path, fps, frame.shape[1], frame.shape[0], count, pixel_aspect=aspect, interlaced=fields)
 
 
 def _rgb_frames(container: "InputContainer", stream: "VideoStream", errors: list[str]) -> Iterator[np.ndarray]:
     """Upright frames (H,W,3) of the packets that can be decoded; what is wrong with the others goes to ``errors``."""
     av, path, codec = pyav(), Path(container.name), stream.codec_context.name
     reformatter, ways = av.video.reformatter.VideoReformatter(), av.video.reformatter.Interpolation
-    for packet in packets_of(container, stream, errors):  # a decoder takes one packet at a time
+
+    def decoded() -> Iterator["VideoFrame"]:
+        for packet in packets_of(container, stream, errors):  # a decoder takes one packet at a time
+            try:
+                for frame in stream.decode(packet):
+                    frames_beside(path, codec, frame.width, frame.height, frame.format.padded_bits_per_pixel)
+                    yield frame
+            except (av.FFmpegError, ValueError) as error:
+                errors.append(f" ({reason(error)})")
+
+    for frame in without_fields(stream, decoded(), errors):
+        width, height = square_size(path, stream, frame.width, frame.height)
+        even = (width, height) == (frame.width, frame.height) and width % 2 == height % 2 == 0
+        # Of such frames both ways give the same bytes, this one in a quarter of the time.
+        way = ways.POINT if even and frame.format.name in _PLAIN_FORMATS else ways.BICUBIC
         try:
-            for frame in stream.decode(packet):
-                frames_beside(path, codec, frame.width, frame.height, frame.format.padded_bits_per_pixel)
-                width, height = square_size(path, stream, frame.width, frame.height)
-                even = (width, height) == (frame.width, frame.height) and width % 2 == height % 2 == 0
-                # Of such frames both ways give the same bytes, this one in a quarter of the time.
-                way = ways.POINT if even and frame.format.name in _PLAIN_FORMATS else ways.BICUBIC
-                rgb = reformatter.reformat(frame, width, height, format="rgb24", interpolation=way)
-                yield np.ascontiguousarray(np.rot90(rgb.to_ndarray(), quarter_turns(frame)))
+            rgb = reformatter.reformat(frame, width, height, format="rgb24", interpolation=way).to_ndarray()
         except (av.FFmpegError, ValueError) as error:
             errors.append(f" ({reason(error)})")
+            continue
+        yield np.ascontiguousarray(np.rot90(rgb, quarter_turns(frame)))
 
 
 def _grey_into(frame: np.ndarray, target: np.ndarray) -> None:

@@ -7,6 +7,7 @@ from array import array
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,6 +77,41 @@ def key_frame_sizes(path: Path) -> Iterator[tuple[float, int, int]]:
                     continue
 
 
+def is_interlaced(stream: VideoStream) -> bool:
+    """Whether a stream's header says that its frames are of two fields."""
+    return stream.codec_context.field_order > _PROGRESSIVE
+
+
+def without_fields(stream: VideoStream, frames: Iterator[VideoFrame], errors: list[str]) -> Iterator[VideoFrame]:
+    """Frames, of an interlaced video each made whole by FFmpeg's bwdif from its first field and those beside it.
+
+    The two fields of a frame are half a frame apart in time: in what moves every second line lies elsewhere. What is
+    wrong goes to ``errors`` and ends the frames.
+    """
+    av, first = pyav(), next(frames, None)
+    if first is None:
+        return
+    if not (first.interlaced_frame or is_interlaced(stream)):
+        yield first
+        yield from frames
+        return
+    graph = av.filter.Graph()
+    made_whole = graph.add("bwdif", "mode=send_frame:deint=interlaced")
+    graph.add_buffer(template=stream).link_to(made_whole)
+    made_whole.link_to(graph.add("buffersink"))
+    graph.configure()
+    for frame in chain((first,), frames, (None,)):  # None flushes what waits for the frame after it
+        try:
+            graph.push(frame)
+            while True:
+                yield graph.pull()
+        except (av.BlockingIOError, av.EOFError):
+            continue
+        except (av.FFmpegError, ValueError) as error:
+            errors.append(f" ({reason(error)})")
+            return
+
+
 def quarter_turns(frame: VideoFrame) -> int:
     """By how many quarter turns, counter-clockwise, a stored frame comes upright, as its display matrix says."""
     return round(frame.rotation / 90)
@@ -97,6 +133,7 @@ def square_size(path: Path, stream: VideoStream, width: int, height: int) -> tup
     return wide, high
 
 
+_PROGRESSIVE = 1  # FFmpeg's number of that order of fields; 0 stands for unknown
 _MAX_ASPECT = 4.0
 _MAX_BYTES = 2**36
 _MAX_SIDE = 8192

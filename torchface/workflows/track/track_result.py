@@ -211,6 +211,11 @@ class Tracked:
                 f"anamorphic video: its pixels are {self.video.pixel_aspect:.3g} times as wide as high; landmarks and "
                 f"camera are of its {self.video.width} x {self.video.height} square ones"
             )
+        if self.video.interlaced:
+            lines.append(
+                "interlaced video: its frames are two fields, half a frame apart in time; each was made whole from its "
+                "first field and those beside it (FFmpeg's bwdif), as overlay.mp4 shows them"
+            )
         if self.times is not None:
             lines.append(
                 f"variable frame rate: {self.inputs.rate_varies}; weights.csv and animation.glb have the frames' own "
@@ -235,8 +240,8 @@ class Tracked:
         lost = count - seen
         if lost:
             lines.append(
-                f"{lost} frames without a face: they keep the face before, or with --whole-take lie between those "
-                "before and after; landmarks.csv says which (success 0)"
+                f"{lost} frames without a face: they keep the face before, the first ones that of the first face, or "
+                "with --whole-take lie between those before and after; landmarks.csv says which (success 0)"
             )
         bounds = self.bounds()
         dark = self.hidden_share()
