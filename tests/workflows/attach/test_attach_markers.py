@@ -8,7 +8,9 @@ import torch
 
 from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.errors import AlignmentError, ValueRangeError
+from torchface.geometry.rotations import rotation_matrix
 from torchface.io import save_rig, save_take
+from torchface.synthetic import performer
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.workflows.attach.attach_markers import AttachSettings, attach, cleaned_fit, helmet_markers
 
@@ -85,3 +87,29 @@ def test_markers_that_no_pose_explains_are_refused_with_the_flag_that_says_where
     assert "lie nowhere" not in str(refused.value)
     assert ("--initial says it roughly" in str(refused.value)) == said
     assert not (tmp_path / "out.json").exists()
+
+
+def test_a_head_that_moves_freely_in_the_volume_moves_no_site(tmp_path: Path) -> None:
+    whole = performer(texture=False)
+    rig = whole.select(["jawOpen", "mouthPucker", "mouthSmileLeft", "mouthSmileRight", "browInnerUp", "noseSneerLeft"])
+    sites = place_markers(rig, 40)
+    weights = torch.rand(100, len(rig.names), generator=torch.Generator().manual_seed(0)).square()
+    take = record(rig, sites, weights, torch.Generator().manual_seed(0), StageFlaws(noise=0.1, missing=0.02)).take
+    phase = torch.arange(len(take)) / 20
+    turned = rotation_matrix(0.7 * torch.stack([0.3 * phase.sin(), phase.cos(), 0 * phase], 1))
+    walked = 1000 * torch.stack([phase.sin(), 1.5 + 0 * phase, phase.cos()], 1)
+    save_rig(rig, tmp_path / "rig.glb")
+    found = []
+    for name, moved in (("still", False), ("freely", True)):
+        values = take.markers.values
+        values = values @ turned.transpose(1, 2) + walked[:, None] if moved else values
+        save_take(replace(take, markers=Track(take.markers.names, values)), tmp_path / f"{name}.c3d")
+        found.append(attach(tmp_path / "rig.glb", tmp_path / f"{name}.c3d", tmp_path / f"{name}.json"))
+    still, freely = found
+    faces, rest = rig.neutral.faces, rig.vertices
+    apart = (still.fit.attachment.on(faces, rest) - freely.fit.attachment.on(faces, rest)).norm(dim=1)
+    assert apart.max() < 0.3
+    assert freely.warnings == still.warnings == ()
+    assert freely.cleanup.masked.sum() == 0
+    assert freely.fit.motion.translation.norm(dim=1).max() > 1000
+    assert 40 < freely.fit.motion.degrees().norm(dim=1).max() < 90

@@ -83,12 +83,8 @@ def check_exchanged(capture: Capture, pair: tuple[int, int], share: float, which
     assert found.warnings == ()
 
 
-@pytest.mark.parametrize(("turn", "way", "free"), [(0.9, 60.0, False), (0.9, 200.0, True), (0.12, 200.0, False)])
-def test_a_head_that_moves_freely_in_the_volume_costs_nothing(
-    stage: Capture, turn: float, way: float, free: bool
-) -> None:
-    rig, sites, _ = stage
-    take, true = recorded(stage, frames=60)
+def moving(take: Take, turn: float, way: float) -> Take:
+    """The take of a head that turns by so many radians either way, and walks so many millimetres."""
     assert take.markers is not None
     values = take.markers.values
     phase = torch.linspace(0, 6.28, len(values))
@@ -96,11 +92,53 @@ def test_a_head_that_moves_freely_in_the_volume_costs_nothing(
     middle = values.nanmean((0, 1))
     moved = (values - middle) @ turned.transpose(1, 2) + middle
     moved = moved + way * torch.stack([phase.sin(), 0 * phase, (2 * phase).cos()], 1)[:, None]
-    freely = replace(take, markers=Track(take.markers.names, moved))
+    return replace(take, markers=Track(take.markers.names, moved))
+
+
+@pytest.mark.parametrize(("turn", "way", "free"), [(0.9, 60.0, False), (0.9, 200.0, True), (0.12, 200.0, False)])
+def test_a_head_that_moves_freely_in_the_volume_costs_nothing(
+    stage: Capture, turn: float, way: float, free: bool
+) -> None:
+    rig, sites, _ = stage
+    take, true = recorded(stage, frames=60)
+    freely = moving(take, turn, way)
     found = solve_markers(rig, sites, freely, replace(AS_IN_THE_HOW_TO, free_scale=free))
     assert mesh_error(rig, found, true) < 1.1 * clean_error(stage, 0, 60)
-    with pytest.raises(AlignmentError, match=r"or of the head in the volume, .* add --slip"):
-        solve_markers(rig, sites, freely, replace(AS_IN_THE_HOW_TO, slip=False))
+    assert found.warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("given", "missing"),
+    [({"slip": False}, "--slip"), ({"align": False}, "--align"), ({"scale": 1e-3}, "--align --slip")],
+)
+def test_a_head_that_moves_freely_is_refused_with_how_far_and_the_flags_that_are_missing(
+    stage: Capture, given: dict[str, float], missing: str
+) -> None:
+    rig, sites, _ = stage
+    freely = moving(recorded(stage, frames=60)[0], 0.7, 500.0)
+    if (scale := given.get("scale")) is not None:
+        freely = replace(freely, markers=Track(freely.markers.names, scale * freely.markers.values))
+        settings, expected = SolveSettings(), f"add --unit m, and {missing}, as the head moves in the volume"
+    else:
+        settings = replace(AS_IN_THE_HOW_TO, **given)
+        expected = rf"the head moves in the volume, by up to \d{{3,4}}\.\d mm and \d+\.\d degrees; .* add {missing};"
+    with pytest.raises(AlignmentError, match=expected):
+        solve_markers(rig, sites, freely, settings)
+
+
+def test_a_frame_at_rest_shows_the_scale_of_a_head_that_moves_freely(stage: Capture) -> None:
+    rig, sites, (weights,) = stage
+    weights = weights.clone()
+    weights[7] = 0.0
+    take, true = recorded((rig, sites, [weights]), frames=60)
+    settings = SolveSettings(neutral=7, clean=True, slip=True)
+    steady = solve_markers(rig, sites, take, settings)
+    freely = moving(take, 0.9, 500.0)
+    found = solve_markers(
+        rig, sites, replace(freely, markers=Track(sites.labels, 0.8 * freely.markers.values)), settings
+    )
+    assert 0.8 * float(found.alignment.scale) == pytest.approx(float(steady.alignment.scale), rel=0.003)
+    assert mesh_error(rig, found, true) < 1.1 * mesh_error(rig, steady, true)
 
 
 def test_wrong_markers_in_a_frame_are_no_motion_of_the_helmet(stage: Capture) -> None:

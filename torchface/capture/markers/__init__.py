@@ -4,7 +4,8 @@ from torchface.capture.markers.attachment.attachment_fit import AttachmentFit, c
 from torchface.capture.markers.attachment.initial_sites import sites_by_shape
 from torchface.capture.markers.attachment.site_uncertainty import SiteUncertainty
 from torchface.capture.markers.cleaning.take_cleaning import Cleanup, Defect, clean_take
-from torchface.capture.markers.helmet_solver import HelmetMotion, HelmetSolver
+from torchface.capture.markers.helmet_motion import HelmetMotion
+from torchface.capture.markers.helmet_solver import HelmetSolver
 from torchface.capture.markers.hybrid_solver import HybridSolver, gamma_curves
 from torchface.capture.markers.marker_labels import LabelMatch, match_labels, own_labels
 from torchface.capture.markers.marker_solver import MarkerSolver

@@ -1,6 +1,6 @@
 """Blendshape weights from markers of a head-mounted stage whose helmet slips on the head."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -8,10 +8,10 @@ from torch import Tensor, nn
 from torchface.attachment import Attachment
 from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
 from torchface.capture.energy import Quadratic, chunks_of_frames, marker_term
+from torchface.capture.markers.helmet_motion import HelmetMotion, rigid_columns, rigid_rotation, rough_motion
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver, frames_seen, markers_of
 from torchface.errors import ShapeError
-from torchface.geometry.rotations import rotation_matrix, rotation_vector
-from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.geometry.similarity import Similarity
 from torchface.optim import BoxQP, box_qp
 from torchface.optim.box_checks import default_tolerance
 from torchface.optim.data_dependent import data_dependent
@@ -19,60 +19,9 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.temporal import interpolated, nearest_rows
 
-# Rotations are scaled to the motion of a point this far from the pivot, in mm, so that all six columns are of one size.
-_ARM = 30.0
 # mm² a marker for a squared millimetre of slip: counts only where markers are too few to determine a motion.
 _MOTION_RIDGE = 1e-4
 _MAX_ITERATIONS, _MOTION_TOLERANCE = 6, 1e-4
-_ENOUGH = 6  # markers from which a motion is known beside the expression's
-_ROUGH_ROUNDS, _ROUGH = 4, 2.0  # millimetres: what is nearer counts in full
-
-
-@dataclass(frozen=True, eq=False)
-class HelmetMotion:
-    r"""The motion of the helmet against the head: a point p of the face was seen at :math:`R (p - c) + c + t`.
-
-    Args:
-        rotation: :math:`R`, (T,3,3).
-        translation: :math:`t`, (T,3), millimetres of rig space.
-        pivot: :math:`c`, (3,), the mean of the marker sites at rest.
-
-    Example:
-        >>> slip = HelmetMotion(torch.eye(3)[None], torch.tensor([[0.0, 4.0, 0.0]]), torch.zeros(3))
-        >>> slip.undo(slip.apply(torch.ones(1, 2, 3))).tolist()
-        [[[1.0, 1.0, 1.0], [1.0, 1.0, 1.0]]]
-    """
-
-    rotation: Tensor
-    translation: Tensor
-    pivot: Tensor
-
-    def apply(self, points: Tensor) -> Tensor:
-        """Where points of the face (T,M,3) were seen."""
-        centred = points - self.pivot.to(points)
-        moved = centred @ self.rotation.transpose(1, 2).to(points)
-        return moved + (self.pivot + self.translation)[:, None].to(points)
-
-    def undo(self, markers: Tensor) -> Tensor:
-        """Seen markers (T,M,3) without the helmet's motion."""
-        return (markers - (self.pivot + self.translation)[:, None].to(markers)) @ self.rotation.to(
-            markers
-        ) + self.pivot.to(markers)
-
-    def after(self, first: "HelmetMotion") -> "HelmetMotion":
-        """This motion of what has moved by another, about the same pivot."""
-        turned = (self.rotation @ first.translation[..., None])[..., 0]
-        return HelmetMotion(self.rotation @ first.rotation, turned + self.translation, self.pivot)
-
-    @staticmethod
-    def none(seen: Tensor, pivot: Tensor) -> "HelmetMotion":
-        """No motion in as many frames as ``seen`` (T,M,3) has."""
-        still = torch.eye(3, dtype=seen.dtype, device=seen.device).repeat(len(seen), 1, 1)
-        return HelmetMotion(still, seen.new_zeros(len(seen), 3), pivot)
-
-    def degrees(self) -> Tensor:
-        """The rotation vectors, (T,3), degrees."""
-        return torch.rad2deg(rotation_vector(self.rotation))
 
 
 class HelmetSolver(nn.Module):
@@ -222,36 +171,3 @@ class HelmetSolver(nn.Module):
 
     def extra_repr(self) -> str:
         return f"exact={self.exact}"
-
-
-def rough_motion(seen: Tensor, rest: Tensor) -> tuple[HelmetMotion, Tensor]:
-    """How a frame's markers (T,M,3) lie beside their sites at rest (M,3) as a whole, and the frames (K,) that show it.
-
-    The others have no motion: they show too few markers. Markers far from where most lie count little.
-    """
-    pivot = rest.mean(0)
-    found = HelmetMotion.none(seen, pivot)
-    rows = ((~torch.isnan(seen).any(-1)).sum(1) >= _ENOUGH).nonzero()[:, 0]
-    if len(rows):
-        sites, marks = rest.expand_as(seen[rows]), seen[rows]
-        placed = similarity_transform(sites, marks, scale=False)
-        for _ in range(_ROUGH_ROUNDS):  # spikes and exchanged labels count little
-            off = (placed.apply(sites) - marks).norm(dim=-1).nan_to_num(0.0)
-            usual = off.median(1, keepdim=True).values.clamp(min=_ROUGH)
-            placed = similarity_transform(sites, marks, 1 / (1 + (off / usual).square()), scale=False)
-        found.rotation[rows] = placed.rotation
-        found.translation[rows] = placed.rotation @ pivot + placed.translation - pivot
-    return found, rows
-
-
-def rigid_columns(rest: Tensor, pivot: Tensor) -> Tensor:
-    """Six columns of rigid motion (M,3,6) for sites at rest (M,3): along x, y, z, then about them, each of 1 mm."""
-    arm = (rest - pivot)[:, None, :].expand(-1, 3, -1)
-    axes = torch.eye(3, dtype=rest.dtype, device=rest.device).expand(len(rest), 3, 3)
-    rotations = torch.linalg.cross(axes, arm, dim=-1) / _ARM
-    return torch.cat([axes, rotations.transpose(1, 2)], dim=2)
-
-
-def rigid_rotation(weights: Tensor) -> Tensor:
-    """The rotations (B,3,3) of weights (B,3) of the last three of ``rigid_columns``."""
-    return rotation_matrix(weights / _ARM)

@@ -6,9 +6,11 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from torchface.capture.markers.frame_poses import MIN_MARKERS, frame_poses
+from torchface.capture.markers.helmet_motion import HelmetMotion, free_motion
 from torchface.capture.markers.rest_pose import pose_of_take, solve_weights
 from torchface.geometry.mirrored_points import check_mirrored
-from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.geometry.similarity import Similarity
 
 # Shares of the sites' mean distance from their centre, 45 to 70 mm on a head. On real takes the markers of a rig that
 # fits stay within 0.009 with noise of 0.3 mm and 0.03 with 1 mm, swaps and gaps included; those of another head's rig,
@@ -26,7 +28,6 @@ _UNIT_TOLERANCE = 1.25
 # Beyond this no helmet slips: half the radius of the sites, or half a radian.
 _MAX_SLIP, _MAX_SLIP_ANGLE = 0.5, 0.5
 _FRAMES, _RIDGE = 240, 0.01
-_SLIP_ITERATIONS, _TOLERANCE = 40, 1e-3
 
 
 @dataclass(frozen=True)
@@ -37,11 +38,12 @@ class FitCheck:
         distance: median over all samples that were seen, millimetres of rig space.
         radius: of the sites at rest, mean distance from their centre, millimetres.
         cause: what most likely is wrong: ``unit``, ``alignment``, ``mirror`` (left-handed coordinates, or sides
-            swapped), ``slip`` (the helmet moves on the head) or ``attachment`` (sites, labels or rig are other ones);
-            empty where nothing is.
+            swapped), ``motion`` (the head moves freely in the volume), ``slip`` (the helmet moves on the head) or
+            ``attachment`` (sites, labels or rig are other ones); empty where nothing is.
         corrected: the distance without that cause, millimetres; NaN where no correction helps.
         similarity: that aligns the markers with the rig best, (1,).
         read_as: the unit that the markers were read in, where it is known.
+        motion: of a head that moves freely.
 
     Example:
         >>> check = FitCheck(distance=60.0, radius=70.0, cause="mirror", corrected=0.4)
@@ -55,6 +57,7 @@ class FitCheck:
     corrected: float = math.nan
     similarity: Similarity | None = None
     read_as: str | None = None
+    motion: HelmetMotion | None = None
 
     @property
     def limit(self) -> float:
@@ -93,20 +96,19 @@ class FitCheck:
         return unit_of_scale(float(self.similarity.scale[0]), self.read_as) or "mm"
 
 
-def check_fit(affine: Tensor, markers: Tensor, slip: bool = False, aligned: bool = False) -> FitCheck:
+def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
     """Solves some frames of a take for weights, and where markers stay far from the rig looks for the cause.
 
     Weights are solved with hardly a penalty, so that the distance is what the rig cannot explain. Where its median
     is more than noise, the take is aligned by one similarity, then by a rigid motion a frame; a correction that leaves
     less than half of the distance is the cause, and a scale near that of a unit makes it the unit. Markers whose mirror
-    image fits clearly better are mirrored. Label swaps, spikes
-    and markers that fell off move the median little: they are no cause.
+    image fits clearly better are mirrored. Label swaps, spikes and markers that fell off move the median little: they
+    are no cause.
 
     Args:
         affine: of each marker's site in the weights, (M,3,N+1), mm: at rest, then each shape's delta.
         markers: (T,M,3), in rig space as far as is known, NaN for not seen.
         slip: the helmet's motion will be taken out: it is not part of the distance.
-        aligned: the take has been aligned with the rig: what is left of a rigid motion is the head's, however large.
 
     Returns:
         A ``FitCheck``.
@@ -134,6 +136,9 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False, aligned: bool
         return found
     if int((~torch.isnan(few).any(-1).all(0)).sum()) < 3:
         return _uncorrected(found)
+    motion = free_motion(few)
+    if motion is not None:
+        found, few = replace(found, motion=motion), motion.undo(few)
     if check_mirrored(few.nanmedian(0).values, rest).mirrored:
         flipped = few * few.new_tensor([-1.0, 1.0, 1.0])
         pose = pose_of_take(affine, flipped)
@@ -141,19 +146,17 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False, aligned: bool
     pose = pose_of_take(affine, few)
     laid = pose.apply(few)
     near = not _is_elsewhere(pose, few, radius)
-    if slip and (near or aligned):
-        steady = _with_slip(affine, few, found)
-        if near or not steady.refused:
-            return steady
+    if slip and near and motion is None:
+        return _with_slip(affine, few, found)
     found = replace(found, similarity=pose)
     corrected = _distance(affine, laid)
-    if replace(found, distance=corrected).noisy and (near or aligned) and not slip:
-        moved = _distance(affine, _without_motion(affine, few if aligned else laid))
-        if moved < _CORRECTED * corrected:
-            return replace(found, cause="slip", corrected=moved)
+    named = unit_of_scale(float(pose.scale[0])) if corrected <= found.limit else ""
+    if not named and (motion is not None or (replace(found, distance=corrected).noisy and near and not slip)):
+        moved = _distance(affine, _without_motion(affine, laid))
+        if moved < _CORRECTED * (corrected if motion is None else distance):
+            return replace(found, cause="slip" if motion is None else "motion", corrected=moved)
     if corrected < _CORRECTED * distance and corrected <= found.limit:
-        cause = "unit" if unit_of_scale(float(pose.scale[0])) else "alignment"
-        return replace(found, cause=cause, corrected=corrected)
+        return replace(found, cause="unit" if named else "alignment", corrected=corrected)
     return _uncorrected(found)
 
 
@@ -199,16 +202,6 @@ def _distance(affine: Tensor, markers: Tensor) -> float:
 
 
 def _without_motion(affine: Tensor, markers: Tensor) -> Tensor:
-    """Markers (T,M,3) with each frame aligned with the rig by a rigid motion, alternating with the weights."""
-    rest = affine[..., 0].expand_as(markers)
-    able = (~torch.isnan(markers).any(-1)).sum(1) >= 3
-    markers = markers[able]
-    moved = similarity_transform(markers, rest[able], scale=False).apply(markers)
-    weights = None
-    for _ in range(_SLIP_ITERATIONS):
-        weights = solve_weights(affine, moved, _RIDGE, weights)
-        on_rig = affine[..., 0] + torch.einsum("mcn,tn->tmc", affine[..., 1:], weights)
-        before, moved = moved, similarity_transform(markers, on_rig, scale=False).apply(markers)
-        if float((moved - before).norm(dim=-1).nan_to_num().max()) < _TOLERANCE:
-            break
-    return moved
+    """Markers (T,M,3) of the frames that show a rigid motion, without it."""
+    markers = markers[(~torch.isnan(markers).any(-1)).sum(1) >= MIN_MARKERS]
+    return frame_poses(affine, markers, markers.new_ones(()), _RIDGE)[1].apply(markers)

@@ -13,6 +13,7 @@ from torchface.capture.markers import AttachmentFit, Cleanup, check_attachment, 
 from torchface.capture.markers.attachment.attachment_fit import marker_paths
 from torchface.capture.markers.cleaning.label_swaps import find_swaps_by_shape, swapped_back
 from torchface.capture.markers.cleaning.take_cleaning import Defect
+from torchface.capture.markers.helmet_motion import free_motion
 from torchface.capture.markers.rest_pose import check_not_mirrored, inlier_markers
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.files.content_keys import content_key
@@ -73,9 +74,7 @@ class AttachReport:
         if self.fit.standoff:
             lines.append(f"markers stand {self.fit.standoff:.2f} mm above the skin")
         if self.fit.motion is not None:
-            slid = float(self.fit.motion.translation.norm(dim=1).max())
-            angle = float(self.fit.motion.degrees().norm(dim=1).max())
-            lines.append(f"helmet or head: moved by up to {slid:.1f} mm and {angle:.1f} degrees; solved along")
+            lines.append(f"helmet or head: moved by up to {self.fit.motion.extent()}; solved along")
         if self.cleanup.defects:
             lines.append(f"cleanup: {self.cleanup.summary()}")
         return [*(f"warning: {warning}" for warning in self.warnings), *lines, *self._uncertain()]
@@ -223,6 +222,11 @@ def attach(
     progress("reading the range of motion")
     start = None if settings.initial is None else load_sites(settings.initial, loaded.neutral, rig)
     take, start, notes = read_range_of_motion(rom, start, settings.options)
+    assert take.markers is not None
+    head = free_motion(take.markers.values.double())
+    if head is not None:
+        steady = head.undo(take.markers.values.double()).to(take.markers.values)
+        take = replace(take, markers=replace(take.markers, values=steady))
     if start is None:
         progress("looking for the pose in which the markers lie on the face")
         start = sites_by_shape(loaded, take)
@@ -243,6 +247,9 @@ def attach(
         fitted = fit.attachment if settings.standoff else replace(fit.attachment, residual=None)
         free = align_take(loaded, fitted, take, insist=True)
     notes = [*notes, *scale_warnings(float(free.scale[0]), not free_scale, take.extras.get("unit"))]
+    if head is not None:
+        motion = head.moved_by(fit.alignment)
+        fit = replace(fit, motion=motion if fit.motion is None else motion.after(fit.motion))
     try:
         check_attachment(fit, loaded)
     except (AlignmentError, ValueRangeError) as error:

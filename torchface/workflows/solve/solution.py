@@ -18,14 +18,13 @@ from torchface.capture import (
     rest_residual,
 )
 from torchface.capture.markers import Cleanup, FitCheck, HelmetMotion
-from torchface.capture.markers.helmet_solver import rough_motion
+from torchface.capture.markers.helmet_motion import free_motion
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY
 from torchface.evaluation.mesh_errors import marker_offsets
-from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.geometry.similarity import Similarity
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, empty_frames
-from torchface.temporal import nearest_rows
 from torchface.workflows.marker_input import scale_warnings
 from torchface.workflows.solve.head_camera import Predicted
 from torchface.workflows.solve.take_check import (
@@ -40,9 +39,6 @@ from torchface.workflows.solve.weight_stream import StreamReport
 
 # A take is cleaned again where its alignment moves a site farther after the first cleaning, mm.
 _REALIGNED = 0.1
-_SLIPS = 0.3  # of the sites' mean distance from their centre: farther no helmet slips
-_SHARE_MOVES = 0.05  # of the frames in which it does; in fewer it is markers that are wrong
-_SAME_SCALE = 0.03  # logarithm
 _MOST = 0.8  # of the samples, below which a take shows too little
 _STRAY = 8.0  # times the median distance: noise stays below it, spikes and exchanged labels do not
 _SHOWN_SPANS = 6
@@ -172,11 +168,7 @@ class SolveReport:
         )
         lines.append(f"solved in {self.seconds:.2f} s, {1000 * self.seconds / max(frames, 1):.3f} ms a frame")
         if solution.motion is not None:
-            translation = float(solution.motion.translation.norm(dim=1).max())
-            rotation = float(solution.motion.degrees().norm(dim=1).max())
-            lines.append(
-                f"helmet or head: moved by up to {translation:.1f} mm and {rotation:.1f} degrees; not in the weights"
-            )
+            lines.append(f"helmet or head: moved by up to {solution.motion.extent()}; not in the weights")
         if solution.cleanup is not None:
             lines.append(f"cleanup: {solution.cleanup.summary()}")
             rows = solution.cleanup.table(gaps=False)
@@ -205,17 +197,17 @@ def solve_markers(
     whole = predicted is None and not settings.frame_by_frame
     warnings = check_coverage(attachment, take, len(rig.names), settings.insist).warnings()
 
-    alignment, raw = None, take
+    assert take.markers is not None
+    alignment, head, raw = None, None, take
     if settings.align or settings.neutral is not None:
         progress("aligning the take with the rig")
-        alignment = _aligned(rig, attachment, raw, settings)
+        if settings.slip and (head := free_motion(take.markers.values.double())) is not None:
+            raw = _moved(take, head.undo)
+        alignment = align_take(rig, attachment, raw, settings.neutral, settings.insist, settings.free_scale)
         take = _moved(raw, alignment.apply)
     solver = MarkerSolver(rig, attachment, sparsity=settings.sparsity, ridge=settings.ridge)
     fit = check_explained(solver, take, alignment is not None, settings.slip, settings.insist)
-    warnings += fit_warnings(fit, alignment is not None)
-    rough = _rough_motion(solver, take) if settings.slip else None
-    if rough is not None:
-        take = _moved(take, rough.undo)
+    warnings += fit_warnings(fit, alignment is not None, settings.slip)
     warnings += _empty_frame_warnings(take)
     if settings.neutral is not None:
         warnings += neutral_warnings(rig, attachment, raw, settings.neutral, settings.free_scale)
@@ -226,7 +218,7 @@ def solve_markers(
     else:
         progress("looking for what is wrong with the take")
         cleanup = clean_take(solver, take, settings.slip)
-        if alignment is not None and rough is None and any(defect.kind != "gap" for defect in cleanup.defects):
+        if alignment is not None and any(defect.kind != "gap" for defect in cleanup.defects):
             # What was wrong with the take moved its alignment, and the alignment its cleaning.
             repaired = _moved(cleanup.take, alignment.inverse().apply)
             better = align_take(rig, attachment, repaired, settings.neutral, settings.insist, settings.free_scale)
@@ -258,8 +250,8 @@ def solve_markers(
     if cleanup is not None and cleanup.take.markers is not None:  # what was filled in was not seen
         markers = torch.where(torch.isnan(cleanup.take.markers.select(labels).values), torch.nan, markers)
     sites = attachment.select(labels)
-    if rough is not None and motion is not None:
-        motion = rough.after(motion)
+    if head is not None and motion is not None and alignment is not None:
+        motion = head.moved_by(alignment).after(motion)
     solution = Solution(rig, solved, markers, sites, alignment, motion, cleanup)
     return replace(solution, warnings=(*warnings, *solution.stray_warnings))
 
@@ -269,44 +261,6 @@ def _moved(take: Take, move: Callable[[Tensor], Tensor]) -> Take:
     assert take.markers is not None
     values = take.markers.values
     return replace(take, markers=Track(take.markers.names, move(values.double()).to(values)))
-
-
-def _aligned(rig: BlendshapeRig, attachment: Attachment, take: Take, settings: SolveSettings) -> Similarity:
-    """The similarity that moves a take's markers into the rig's space, also of a head that moves freely.
-
-    Where such a head turns, its markers' mean places are those of a smaller face: its scale is that of each frame.
-    """
-    found = align_take(rig, attachment, take, settings.neutral, settings.insist, settings.free_scale)
-    if not (settings.slip and settings.free_scale) or settings.neutral is not None:
-        return found
-    assert take.markers is not None
-    solver = MarkerSolver(rig, attachment)
-    seen, rest = solver.arrange(take.markers).double(), solver.rest.double()
-    seen = seen[rough_motion(seen, rest)[1]]
-    if not len(seen):
-        return found
-    scale = similarity_transform(seen, rest.expand_as(seen)).scale.median()
-    if abs(float((scale / found.scale[0]).log())) < _SAME_SCALE:
-        return found
-    scaled = _moved(take, lambda points: scale * points)
-    held = align_take(rig, attachment, scaled, settings.neutral, settings.insist, scale=False)
-    return Similarity(scale * held.scale, held.rotation, held.translation)
-
-
-def _rough_motion(solver: MarkerSolver, take: Take) -> HelmetMotion | None:
-    """How each frame's markers lie as a whole, where a head moves freely in a volume; None where a helmet slips, whose
-    motion is solved for with the weights."""
-    assert take.markers is not None
-    rest = solver.rest.double()
-    found, rows = rough_motion(solver.arrange(take.markers).double(), rest)
-    if not len(rows):
-        return None
-    radius = float((rest - found.pivot).norm(dim=1).mean())
-    moved = (found.apply(rest.expand(len(take), -1, -1)) - rest)[rows].norm(dim=-1).mean(1)
-    if float(moved.quantile(1 - _SHARE_MOVES)) < _SLIPS * radius:
-        return None
-    nearest = rows[nearest_rows(rows, len(take))]
-    return HelmetMotion(found.rotation[nearest], found.translation[nearest], found.pivot)
 
 
 def _without_slip(

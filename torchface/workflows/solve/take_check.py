@@ -91,23 +91,23 @@ def check_explained(solver: MarkerSolver, take: Take, aligned: bool, slip: bool,
     refused."""
     assert take.markers is not None
     markers = solver.arrange(take.markers).double()
-    fit = check_fit(torch.cat([solver.rest[..., None], solver.every_basis], dim=2), markers, slip, aligned)
+    fit = check_fit(torch.cat([solver.rest[..., None], solver.every_basis], dim=2), markers, slip)
     fit = replace(fit, read_as=take.extras.get("unit"))
     if fit.refused and not insist:
         raise AlignmentError(
             f"{_source(take)}: the rig brings the marker sites no nearer to the markers than {fit.distance:.4g} mm "
-            f"(median), expected at most {fit.limit:.2g} mm; {_cause(fit, aligned)}; {_INSIST}"
+            f"(median), expected at most {fit.limit:.2g} mm; {_cause(fit, aligned, slip)}; {_INSIST}"
         )
     return fit
 
 
-def fit_warnings(fit: FitCheck, aligned: bool) -> list[str]:
+def fit_warnings(fit: FitCheck, aligned: bool, slip: bool) -> list[str]:
     """Warnings for a take that the rig explains badly; none for one that it explains."""
     if not fit.cause:
         return []
     return [
         f"the rig brings the marker sites no nearer to the markers than {fit.distance:.4g} mm (median); "
-        f"{_cause(fit, aligned)}"
+        f"{_cause(fit, aligned, slip)}"
     ]
 
 
@@ -202,15 +202,25 @@ def label_warnings(solver: MarkerSolver, take: Take, slip: bool) -> list[str]:
     return lines
 
 
-def _cause(fit: FitCheck, aligned: bool) -> str:
+def _cause(fit: FitCheck, aligned: bool, slip: bool) -> str:
+    if fit.cause == "motion":
+        assert fit.motion is not None
+        advice = " ".join(flag for flag, given in (("--align", aligned), ("--slip", slip)) if not given)
+        return (
+            f"the head moves in the volume, by up to {fit.motion.extent()}; without this motion {fit.corrected:.2g} mm "
+            f"are left: add {advice}"
+        )
     if fit.cause == "unit":
         assert fit.similarity is not None
         factor = float(fit.similarity.scale[0])
         sizes = f"{factor:.4g} times larger" if factor > 1 else f"{1 / factor:.4g} times smaller"
+        space = "--align if it is not in the rig's space"
+        if fit.motion is not None:
+            space = "--align --slip, as the head moves in the volume"
         names = {"m": "metres", "cm": "centimetres", "in": "inches", "mm": "millimetres", "um": "micrometres"}
         return (
             f"{sizes} they lie {fit.corrected:.2g} mm from it, so the take seems to be in {names[fit.unit]}: add "
-            f"--unit {fit.unit}, and --align if it is not in the rig's space"
+            f"--unit {fit.unit}, and {space}"
         )
     if fit.cause == "alignment":
         assert fit.similarity is not None
@@ -228,10 +238,7 @@ def _cause(fit: FitCheck, aligned: bool) -> str:
             "rig's space), or the labels of left and right are swapped (--labels)"
         )
     if fit.cause == "slip":
-        return (
-            f"without the motion of the helmet against the head, or of the head in the volume, {fit.corrected:.2g} mm "
-            "are left: add --slip"
-        )
+        return f"without the motion of the helmet against the head {fit.corrected:.2g} mm are left: add --slip"
     tried = (
         "the take is aligned with the rig" if aligned else "turning, moving and scaling the take does not help enough"
     )

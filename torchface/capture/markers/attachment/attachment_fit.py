@@ -7,17 +7,17 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.capture.markers.attachment.frame_poses import MIN_MARKERS, frame_poses, solve_frames
 from torchface.capture.markers.attachment.site_iterations import LAST_RIDGE, FitState, SiteSearch, SiteSolver
 from torchface.capture.markers.attachment.site_uncertainty import SiteUncertainty
-from torchface.capture.markers.helmet_solver import HelmetMotion
+from torchface.capture.markers.frame_poses import MIN_MARKERS, rough_poses, solve_frames
+from torchface.capture.markers.helmet_motion import HelmetMotion
 from torchface.capture.markers.marker_labels import listed
 from torchface.capture.markers.marker_solver import check_labels
 from torchface.capture.markers.rest_pose import check_not_collinear, check_not_mirrored, inlier_markers, pose_of_points
 from torchface.capture.markers.rig_fit_check import DOUBTFUL_SHARE
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
 from torchface.errors import AlignmentError, ValueRangeError
-from torchface.geometry.similarity import Similarity
+from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.number_checks import checked_type
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
@@ -133,7 +133,7 @@ def fit_attachment(
     if solver.helmet_slips(few, state):
         shown = shown[(~torch.isnan(shown).any(-1)).sum(1) >= MIN_MARKERS]
         few = _spread(shown, _COARSE_FRAMES)
-        by_frame = replace(first, pose=frame_poses(few, initial_points.expand_as(few), pose.scale[0]))
+        by_frame = replace(first, pose=rough_poses(few, initial_points, pose.scale[0]))
         state = solver.alternate(few, by_frame, errors, progress)
     progress("refining sites and weights together")
     for count, careful in ((_CAREFUL_FRAMES, True), (_JOINT_FRAMES, False)):
@@ -221,7 +221,9 @@ def _result(
     helmet = None
     if slips:
         # The scale is known; fitting it would shrink a rotating take.
-        steady = frame_poses(paths[shown].reshape(1, -1, 3), moved.reshape(1, -1, 3), pose.scale[0])
+        scale = pose.scale[:1]
+        steady = similarity_transform(scale * paths[shown].reshape(1, -1, 3), moved.reshape(1, -1, 3), scale=False)
+        steady = replace(steady, scale=scale)
         helmet, pose = _helmet_motion(steady, pose, shown, affine[..., 0].mean(0)), steady
     off_skin = offset.norm(dim=1)
     return AttachmentFit(sites, pose, torch.stack(errors), weights, state.height, off_skin, uncertainty, helmet)

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.capture.markers.helmet_solver import rigid_columns
+from torchface.capture.markers.helmet_motion import rigid_columns
 from torchface.capture.markers.surface_motion import with_one
 from torchface.geometry.similarity import Similarity
 

@@ -8,7 +8,9 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.capture.markers.attachment.best_sites import PathMoments, best_sites
-from torchface.capture.markers.attachment.frame_poses import (
+from torchface.capture.markers.attachment.site_curvature import ARM, SitesOnTake, TakeCurvature, pose_columns
+from torchface.capture.markers.attachment.site_uncertainty import SITE_PRIOR, SiteUncertainty, site_uncertainty
+from torchface.capture.markers.frame_poses import (
     MIN_MARKERS,
     better_pose,
     frame_poses,
@@ -16,8 +18,6 @@ from torchface.capture.markers.attachment.frame_poses import (
     solve_frames,
     without_motion,
 )
-from torchface.capture.markers.attachment.site_curvature import ARM, SitesOnTake, TakeCurvature, pose_columns
-from torchface.capture.markers.attachment.site_uncertainty import SITE_PRIOR, SiteUncertainty, site_uncertainty
 from torchface.capture.markers.rest_pose import inlier_markers, transformed_pose
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
 from torchface.geometry.similarity import Similarity
@@ -34,7 +34,7 @@ _OUTLIER_RATIO = 1.3
 # Curvature that holds the scale where it is.
 _HELD = 1e15
 # The helmet slips where a rigid motion a frame leaves less than this part of the residual.
-_SLIP_RATIO, _MOTION_ITERATIONS = 0.85, 6
+_SLIP_RATIO = 0.85
 _CANDIDATES = 24
 # Of so many triangles about a site those whose motion is most like the marker's are candidates, too.
 _NEIGHBOURHOOD, _SIMILAR = 400, 12
@@ -185,11 +185,7 @@ class SiteSolver:
         if len(state.pose.scale) == 1:
             return replace(state, weights=None)
         rows = state.inliers()
-        affine = self.at(state)[rows]
-        pose = frame_poses(paths, self.at(state)[..., 0].expand_as(paths), state.pose.scale[0])
-        weights: Tensor | None = None
-        for _ in range(_MOTION_ITERATIONS):
-            weights, pose = solve_frames(affine, paths[:, rows], pose, LAST_RIDGE, weights)
+        weights, pose = frame_poses(self.at(state)[rows], paths[:, rows], state.pose.scale[0], LAST_RIDGE)
         return replace(state, pose=pose, weights=weights)
 
     def _with_best_sites(self, paths: Tensor, state: FitState, on_rig: Tensor, rest: Tensor, wide: bool) -> FitState:

@@ -7,12 +7,12 @@ import torch
 from torch import Tensor
 
 from torchface.capture.markers.cleaning.robust_prediction import Prediction
-from torchface.geometry.similarity import similarity_transform
+from torchface.capture.markers.helmet_motion import rough_motion
 
 Votes = Mapping[tuple[int, int], Sequence[tuple[int, int]]]
 
-# Fewer markers have no shape. Far ones count less in a frame's pose, mm.
-_MIN_MARKERS, _POSE_ITERATIONS, _POSE_DISTANCE, _MAX_EXCHANGES = 5, 4, 5.0, 8
+# Fewer markers have no shape.
+_MIN_MARKERS, _MAX_EXCHANGES = 6, 8
 # Two markers are exchanged where that leaves less than this part of their distances from their places.
 _NEARER = 0.5
 _WHOLE_RATIO, _CENTRE_ITERATIONS = 0.25, 8
@@ -68,9 +68,9 @@ def find_swaps_by_shape(markers: Tensor, fps: float) -> list[Swap]:
     if int(known.sum()) < _MIN_MARKERS or not len(able):
         return []
     moved = torch.full_like(markers, torch.nan)
-    moved[able] = _steadied(markers[able], median)
-    median = _centres(moved)
-    moved[able] = _steadied(markers[able], median)
+    for _ in range(2):
+        moved[able] = rough_motion(markers[able], median)[0].undo(markers[able])
+        median = _centres(moved)
     target, place = median.nan_to_num(0.0), moved.nan_to_num(0.0)
     seen = ~torch.isnan(moved).any(-1) & known
     votes: dict[tuple[int, int], list[tuple[int, int]]] = {}
@@ -169,12 +169,3 @@ def _centres(markers: Tensor) -> Tensor:
         distance = (markers - centre).norm(dim=-1, keepdim=True)
         centre = torch.where(distance <= distance.nanmedian(0).values, markers, torch.nan).nanmean(0)
     return centre
-
-
-def _steadied(markers: Tensor, median: Tensor) -> Tensor:
-    """Markers (T,M,3) moved rigidly onto their medians (M,3), those far from them with less weight."""
-    target, weights = median.expand_as(markers), torch.ones_like(markers[..., 0])
-    for _ in range(_POSE_ITERATIONS):
-        moved = similarity_transform(markers, target, weights, scale=False).apply(markers)
-        weights = 1 / (1 + ((moved - target).norm(dim=-1).nan_to_num(0.0) / _POSE_DISTANCE) ** 2)
-    return moved

@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.capture.markers.helmet_solver import rigid_columns
+from torchface.capture.markers.frame_poses import frame_poses
+from torchface.capture.markers.helmet_motion import rigid_columns
 from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
 from torchface.capture.markers.rest_pose import sample_limits
 from torchface.optim import BoxQP
@@ -42,14 +43,18 @@ def predict_markers(
 
     Args:
         seen: markers in rig space, (T,M,3), float64, NaN for not seen.
-        slip: the helmet may move; six rigid columns model it.
+        slip: the helmet may move: by a rigid motion a frame, and six rigid columns for what outliers moved that.
         ignored: markers that are predicted from the others alone, (M,) bool.
     """
     rest, columns = solver.rest.double(), solver.every_basis.double()
     shapes = columns.shape[2]
     lower, upper = rest.new_zeros(shapes), rest.new_ones(shapes)
     ridge, penalty = rest.new_full((shapes,), 2 * _RIDGE), rest.new_full((shapes,), penalty_value(solver.sparsity))
+    pose = None
     if slip:
+        affine = torch.cat([rest[..., None], columns], dim=2)
+        pose = frame_poses(affine, seen, rest.new_ones(()), _RIDGE)[1]
+        seen = pose.apply(seen)
         columns = torch.cat([columns, rigid_columns(rest, rest.mean(0))], dim=2)
         bound = rest.new_full((6,), torch.inf)
         lower, upper = torch.cat([lower, -bound]), torch.cat([upper, bound])
@@ -85,4 +90,5 @@ def predict_markers(
         limit = own.clamp(min=ceiling)
         weights = solve(visible & ~(distance > limit), weights, bias, 2)
     expected = rest + bias + (weights @ rows.T).unflatten(1, (-1, 3))
-    return Prediction(expected, (seen - expected).norm(dim=-1), limit)
+    distance = (seen - expected).norm(dim=-1)
+    return Prediction(expected if pose is None else pose.inverse().apply(expected), distance, limit)

@@ -1,20 +1,32 @@
 """The pose of a take in a rig's space: one similarity, or where the helmet slips one scale and a motion a frame."""
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
-from torchface.capture.markers.helmet_solver import rigid_columns, rigid_rotation
+from torchface.capture.markers.helmet_motion import rigid_columns, rigid_rotation, rough_motion
 from torchface.capture.markers.rest_pose import pose_step, solve_weights
-from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.geometry.similarity import Similarity
 
 # A frame with fewer markers does not determine a rigid motion beside the weights.
 MIN_MARKERS = 6
+_MOTION_ITERATIONS = 6
 
 
-def frame_poses(paths: Tensor, target: Tensor, scale: Tensor) -> Similarity:
-    """Rigid motions after one scale that lay each frame's markers (T,M,3) on points (T,M,3): (T,) similarities."""
-    rigid = similarity_transform(scale * paths, target, scale=False)
-    return Similarity(scale.expand(len(paths)), rigid.rotation, rigid.translation)
+def rough_poses(paths: Tensor, rest: Tensor, scale: Tensor) -> Similarity:
+    """One scale and roughly the rigid motion that lays each frame's markers (T,M,3) on the sites at rest (M,3): (T,)
+    similarities."""
+    return replace(rough_motion(scale * paths, rest)[0].inverse(), scale=scale.expand(len(paths)))
+
+
+def frame_poses(affine: Tensor, paths: Tensor, scale: Tensor, ridge: float) -> tuple[Tensor, Similarity]:
+    """Weights (T,N) and one scale with a rigid motion for each frame, (T,) similarities, solved for together."""
+    weights, pose = None, rough_poses(paths, affine[..., 0], scale)
+    for _ in range(_MOTION_ITERATIONS):
+        weights, pose = solve_frames(affine, paths, pose, ridge, weights)
+    assert weights is not None
+    return weights, pose
 
 
 def solve_frames(
