@@ -59,6 +59,7 @@ from torchface.workflows.fit.picture_checks import (
     picture_lines,
     profile_lines,
 )
+from torchface.workflows.fit.sharpness_checks import sharpness_lines
 from torchface.workflows.fit.video_pictures import video_pictures
 from torchface.workflows.named_finders import part_finder
 from torchface.workflows.named_heads import NamedHeads, load_head_model, matching
@@ -238,6 +239,7 @@ def fit_photographs(
         if not settings.everything:
             of_light, too_dark = light_lines(photograph, image, shown, points)
             remarks, dark = remarks + of_light, dark or too_dark
+    remarks += sharpness_lines(photographs, images, marks) if found else []
     alone = [bare(marks[i : i + 1], [i]) for i in range(len(marks))]
     remarks += width_lines(photographs, alone, heads, rig.neutral.landmarks)
     # The tracker has followed one face through a film.
