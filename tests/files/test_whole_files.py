@@ -372,3 +372,12 @@ def test_a_part_that_fails_is_left_out_of_the_whole(tmp_path: Path) -> None:
             write_file(tmp_path / "part", b"2")
             raise KeyError
     assert [path.name for path in tmp_path.iterdir()] == ["whole"]
+
+
+def test_no_folder_is_made_that_is_called_as_a_file(tmp_path: Path) -> None:
+    """``track film.mp4 --out weights.csv`` asks for something that is not written."""
+    with pytest.raises(FileFormatError, match=r"weights\.csv: found the name of a file, expected a folder's"):
+        make_folder(tmp_path / "weights.csv")
+    (tmp_path / "kept.csv").mkdir()
+    assert make_folder(tmp_path / "kept.csv").is_dir()
+    assert make_folder(tmp_path / "take.v2").is_dir()

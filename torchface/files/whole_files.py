@@ -16,6 +16,8 @@ from torchface.files.input_files import check_no_input, note_read
 from torchface.files.temporary_files import new_temporary, remove_left_over, temporary_name
 from torchface.files.write_errors import unmade, unsettled, unwritten
 
+_FILES = (".csv", ".json", ".toml", ".html", ".mp4", ".mkv", ".avi",
+          ".glb", ".gltf", ".obj", ".ply", ".onnx", ".png", ".jpg")  # fmt: skip
 LARGEST_FILE = 2**31  # bytes; what a head rig with hundreds of shapes stays well below
 
 _writes: dict[Path, int] = {}
@@ -142,8 +144,10 @@ def made_folder(folder: str | Path) -> Iterator[Path]:
 
 
 def make_folder(folder: str | Path) -> Path:
-    """The folder, made with those above it where it is not there yet."""
+    """The folder, made with those above it where it is not there yet; none with the ending of a file."""
     folder = Path(folder)
+    if folder.suffix.lower() in _FILES and not os.path.lexists(folder):
+        raise FileFormatError(f"{folder}: found the name of a file, expected a folder's: several files go into it")
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except (OSError, ValueError) as error:
