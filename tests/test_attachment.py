@@ -47,8 +47,12 @@ def test_saved_and_loaded_is_the_same(tmp_path: Path) -> None:
 def test_other_meshes_are_refused() -> None:
     mesh = tetrahedron()
     attachment = Attachment.from_vertices(mesh, [0, 1])
-    with pytest.raises(TopologyError, match=r"made for topology 5-.*expected the mesh's own, 5-"):
-        attachment.check(Mesh(mesh.vertices, mesh.faces.flip(0)))
+    with pytest.raises(
+        TopologyError, match=r"other triangles than it, or the same in another order \(both have 5 vertices\).*attach"
+    ):
+        attachment.check(Mesh(mesh.vertices, mesh.faces.flip(0)), owner="it")
+    with pytest.raises(TopologyError, match=r"made for a mesh of 5 vertices, expected r\.glb's, of 6;"):
+        attachment.check(Mesh(torch.rand(6, 3), mesh.faces), owner="r.glb")
     with pytest.raises(TopologyError, match="found triangles 0 to 9, expected 0 to 3"):
         Attachment(torch.tensor([0, 9]), torch.eye(3)[:2]).check(mesh)
     with pytest.raises(TopologyError, match=r"vertices \[4\] belong to no triangle"):

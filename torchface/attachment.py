@@ -19,7 +19,7 @@ from torchface.errors import (
 )
 from torchface.files.documents import read_json, write_json
 from torchface.geometry.similarity import similarity_transform
-from torchface.mesh import Mesh
+from torchface.mesh import Mesh, other_topology
 from torchface.number_checks import as_tensor, checked_type
 
 _FORMAT = "torchface.attachment/1"
@@ -146,8 +146,8 @@ class Attachment:
         """
         if self.fingerprint is not None and self.fingerprint != mesh.fingerprint():
             raise TopologyError(
-                f"{source}: found marker sites made for topology {self.fingerprint}, expected {owner}'s own, "
-                f"{mesh.fingerprint()} (vertex count, hash of the triangles)"
+                f"{source}: found marker sites made for {other_topology(self.fingerprint, mesh, owner)}; give the rig "
+                "that they were made for (with the same --part), or find the sites on this one (torchface attach)"
             )
         if len(self.triangles) and (int(self.triangles.min()) < 0 or int(self.triangles.max()) >= len(mesh.faces)):
             raise TopologyError(

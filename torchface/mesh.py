@@ -15,6 +15,8 @@ from torchface.geometry.meshes.trimesh_conversion import from_trimesh, to_trimes
 from torchface.number_checks import as_tensor, checked_type
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import trimesh
 
 _FAN_CELLS = 2**20
@@ -211,6 +213,16 @@ class Mesh:
     def __repr__(self) -> str:
         extra = "" if self.polygons is None else f", {len(self.polygons)} polygons"
         return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} triangles{extra})"
+
+
+def other_topology(fingerprint: str, mesh: Mesh, owner: str | Path = "the mesh") -> str:
+    """What distinguishes the mesh of a fingerprint from another one, for people to read."""
+    count, vertices = fingerprint.partition("-")[0], len(mesh.vertices)
+    if not count.isdecimal():
+        return f"another mesh than {owner}, of {vertices} vertices"
+    if int(count) != vertices:
+        return f"a mesh of {int(count)} vertices, expected {owner}'s, of {vertices}"
+    return f"a mesh with other triangles than {owner}, or the same in another order (both have {vertices} vertices)"
 
 
 def fan_triangulation(polygons: Tensor) -> Tensor:

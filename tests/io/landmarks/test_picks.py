@@ -35,7 +35,7 @@ def test_landmarks_and_pairs_come_back_exactly(tmp_path) -> None:
 
 def test_picks_of_another_mesh_are_refused() -> None:
     other = Mesh(torch.eye(3), torch.tensor([[0, 2, 1]]))
-    with pytest.raises(TopologyError, match="made for topology"):
+    with pytest.raises(TopologyError, match="made for a mesh with other triangles"):
         LandmarkVertices(torch.tensor([0]), ("nose",), triangle().fingerprint()).check(other)
     with pytest.raises(TopologyError, match="expected 0 to 2"):
         Correspondences(torch.tensor([3]), torch.zeros(1, 3), ("nose",)).check(triangle())

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.errors import NameMismatchError, ShapeError, TopologyError
 from torchface.files.documents import Value, read_json, write_json
-from torchface.mesh import Mesh
+from torchface.mesh import Mesh, other_topology
 
 _LANDMARKS, _CORRESPONDENCES = "torchface.landmarks/1", "torchface.correspondences/1"
 _MAX_BYTES = 16 * 2**20
@@ -169,8 +169,8 @@ def _check_labels(vertices: Tensor, labels: tuple[str, ...]) -> None:
 def _check_mesh(vertices: Tensor, fingerprint: str | None, mesh: Mesh) -> None:
     if fingerprint is not None and fingerprint != mesh.fingerprint():
         raise TopologyError(
-            f"picks: made for topology {fingerprint}, the mesh has {mesh.fingerprint()} "
-            "(vertex count, hash of the triangles)"
+            f"picks: made for {other_topology(fingerprint, mesh)}; give the mesh that they were picked on, or pick "
+            "anew (torchface pick)"
         )
     if len(vertices) and (int(vertices.min()) < 0 or int(vertices.max()) >= len(mesh.vertices)):
         raise TopologyError(

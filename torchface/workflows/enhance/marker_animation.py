@@ -13,7 +13,7 @@ from torchface.enhancement.thin_shell import LEAST_POINTS, ThinShell, rigid_moti
 from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.similarity import Similarity, similarity_transform
-from torchface.mesh import Mesh
+from torchface.mesh import Mesh, other_topology
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
 from torchface.temporal.interpolation import interpolated
@@ -66,8 +66,8 @@ def check_attachment(attachment: Attachment, path: Path, rig: BlendshapeRig | No
         return False
     if attachment.fingerprint is not None and attachment.fingerprint != model.fingerprint():
         raise TopologyError(
-            f"{path}: found marker sites made for topology {attachment.fingerprint}, expected the model's, "
-            f"{model.fingerprint()} (vertex count, hash of the triangles), or the rig that they belong to (--rig)"
+            f"{path}: found marker sites made for {other_topology(attachment.fingerprint, model, 'the model')}; give "
+            "the rig that they belong to (--rig)"
         )
     attachment.check(model, path, "the model")
     return True
