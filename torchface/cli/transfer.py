@@ -35,18 +35,20 @@ def transfer(
     """
     from torchface.io import load_mesh, load_rig, save_rig
     from torchface.modeling.rigging.deformation_transfer import transfer_with_report
+    from torchface.modeling.rigging.neutral_check import neutral_notes
     from torchface.workflows.rig.actor_rig import check_out
     from torchface.workflows.rig_names import naming_lines, renamed
 
     check_out(out)
     with progress_bars(quiet) as progress:
         progress("reading the template")
-        source = load_rig(template, part=part)
-        transferred = transfer_with_report(source, load_mesh(neutral, unit=unit), progress=progress)
+        source, head = load_rig(template, part=part), load_mesh(neutral, unit=unit)
+        transferred = transfer_with_report(source, head, progress=progress)
+        notes = neutral_notes(source, head)
         progress("writing the rig")
         save_rig(renamed(transferred.rig, names), out)
     console.print(f"{len(transferred.rig.names)} shapes, {len(transferred.rig.vertices):,} vertices")
-    print_lines(naming_lines(transferred.rig, names))
+    print_lines([*(f"warning: {note}" for note in notes), *naming_lines(transferred.rig, names)])
     if summary := transferred.report.summary():
         console.print(summary)
     print_path(out)

@@ -30,6 +30,7 @@ from torchface.modeling.rigging.expression_regression import (
     neutral_rig,
     rig_from_neutral,
 )
+from torchface.modeling.rigging.neutral_check import neutral_notes
 from torchface.modeling.rigging.open_eyed_neutral import open_eyes
 from torchface.modeling.rigging.other_topology import shapes_on
 from torchface.modeling.rigging.part_clearance import clear_parts
@@ -68,6 +69,7 @@ __all__ = [
     "fit_images",
     "head_model_of",
     "inner_parts",
+    "neutral_notes",
     "neutral_rig",
     "open_eyes",
     "photo_texture",

@@ -27,7 +27,7 @@ _SHIFTS, _LEFT = (1, -1, 2, -2, 3, -3), 0.7
 _STRETCHES, _LEAST_STRETCH = 32, 150  # that the vertices' numbers are cut into; vertices in each
 _FOUND_SHIFTS = 16  # longer ones, which most vertices' nearest vertices of the template give
 _SHORTEST = 1e-3  # of the template's extent: shorter edges count as so long
-_LEAST_DIFFERENCE, _WORST = 0.01, 3.0  # of an edge's length
+_LEAST_DIFFERENCE, _WORST = 0.2, 3.0  # of an edge's length: a smooth surface shifted by a row differs by less
 _KEEP_ORDER = "export it with the order kept (Maya, ZBrush and Blender have a setting for it)"
 
 

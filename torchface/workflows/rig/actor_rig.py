@@ -1,6 +1,6 @@
 """From raw scans of an actor and a template rig on disk to the actor's own rig on disk."""
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
@@ -34,6 +34,7 @@ from torchface.modeling import (
     clear_parts,
     detail_maps,
     inner_parts,
+    neutral_notes,
     neutral_rig,
     open_eyes,
     place_parts,
@@ -163,6 +164,8 @@ def _rig_actor(
         neutral = with_mouth_behind_skin(place_parts(rig, neutral, parts))
         neutral = with_template_skin(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
     transferred = transfer_with_report(rig, neutral, progress=progress)
+    notes = (*registration.record.notes, *(f"warning: {note}" for note in neutral_notes(rig, neutral)))
+    registration = replace(registration, record=replace(registration.record, notes=notes))
     actor: BlendshapeRig = transferred.rig
     predicted = None if regression is None else neutral_rig(regression, rig, neutral)
     if predicted is not None:

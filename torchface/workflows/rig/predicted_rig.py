@@ -9,7 +9,7 @@ from torchface.errors import TopologyError
 from torchface.files.job_lock import file_lock
 from torchface.files.whole_files import all_or_none
 from torchface.io import load_mesh, load_rig, save_rig
-from torchface.modeling import NeutralRig, neutral_rig
+from torchface.modeling import NeutralRig, neutral_notes, neutral_rig
 from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, sheet
@@ -34,6 +34,7 @@ class PredictedRig:
     made: NeutralRig
     model: str
     page: Path
+    notes: tuple[str, ...]  # on a head that is likely not at rest
 
     def lines(self) -> list[str]:
         """For people to read."""
@@ -42,7 +43,7 @@ class PredictedRig:
         unsure = [name for name, row in zip(made.rig.names, made.known & ~made.learned, strict=True) if row]
         line = f"rig: {len(made.rig.vertices)} vertices; of {len(made.rig.names)} shapes {learned} predicted by "
         line += f"{self.model}, {len(made.rig.names) - learned} transferred"
-        lines = [line]
+        lines = [*(f"warning: {note}" for note in self.notes), line]
         if unsure:
             lines.append(
                 f"  transferred though {self.model} knows them, its error would be larger: {', '.join(unsure)}"
@@ -79,12 +80,13 @@ def predict_rig(
             )
         progress("predicting shapes")
         made = neutral_rig(model, source, neutral)
+        notes = neutral_notes(source, neutral)
         progress("writing the rig")
         name, report = Path(expressions).name, out.with_name(f"{out.stem}{REPORT_ENDING}")
         with all_or_none():
             save_rig(renamed(made.rig, options.names), out)
             page = write_page(report, f"Shapes of {out.stem}", _sections(made, name))
-        return PredictedRig(made, name, page)
+        return PredictedRig(made, name, page, notes)
 
 
 def _sections(made: NeutralRig, model: str) -> list[Section]:
