@@ -100,6 +100,26 @@ def face_anchors(path: Path, weights: Tensor, rotations: Tensor) -> Path:
     return path
 
 
+def mediapipe(path: Path, weights: Tensor, javascript: bool = False) -> Path:
+    """Results of the Face Landmarker as Python or JavaScript prints them, at 25 a second; no tongue."""
+    frames: list[dict[str, Any]] = []
+    for frame, values in enumerate(weights):
+        scores = [
+            ("_neutral", 1e-6),
+            *(pair for pair in zip(ARKIT, values.tolist(), strict=True) if pair[0] != "tongueOut"),
+        ]
+        key = "categoryName" if javascript else "category_name"
+        categories = [{"index": i, "score": score, key: name} for i, (name, score) in enumerate(scores)]
+        if javascript:
+            frames.append({"timestamp": 1000 + 40 * frame, "faceBlendshapes": [{"categories": categories}]})
+        else:
+            frames.append(
+                {"timestamp_ms": 40 * frame, "face_blendshapes": [categories], "face_landmarks": [[{"x": 0.5}]]}
+            )
+    path.write_text(json.dumps(frames))
+    return path
+
+
 def gesichter(path: Path, weights: Tensor, rotations: Tensor, numbers: list[int] | None = None) -> Path:
     """gzip of version, number of packets, and each with its size before it."""
     packets = LiveLinkPackets(ARKIT, 60.0, "iPhone")

@@ -9,6 +9,7 @@ import torch
 from planted.characters import Planted, unpacked, write_character
 from torchface import BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.cli import main
+from torchface.errors import NameMismatchError
 from torchface.io import load_animation
 from torchface.io.images.image_files import load_image
 from torchface.io.weights.weight_csv import ROTATIONS
@@ -56,6 +57,28 @@ def test_most_shapes_without_a_name_on_the_target_are_counted(tmp_path: Path) ->
     save_take(Take(60.0, weights=Track(names, torch.tensor([[0.5, 0.5, 0.5, 0.0]])[..., None])), tmp_path / "take.csv")
     done = retarget_weights(tmp_path / "take.csv", tmp_path / "rig.glb", WeightFiles(tmp_path / "out.csv"))
     assert any("only 1 of the 3 shapes that move in" in warning for warning in done.warnings)
+
+
+def test_action_units_of_openface_move_a_rig_and_those_without_a_shape_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig = performer(texture=False).select(["jawOpen", "mouthSmileLeft", "mouthSmileRight"])
+    save_rig(rig, tmp_path / "rig.glb")
+    header = "frame, timestamp, confidence, success, x_0, y_0, AU12_r, AU25_r, AU26_r, AU26_c"
+    (tmp_path / "film.csv").write_text(f"{header}\n1, 0, 1, 1, 10, 10, 3, 1, 5, 1\n2, 0.04, 1, 1, 10, 10, 0, 1, 0, 0\n")
+    out = tmp_path / "out.csv"
+    main(["retarget", str(tmp_path / "film.csv"), "--to", str(tmp_path / "rig.glb"), "--out", str(out)])
+    said = " ".join(capsys.readouterr().err.split())
+    assert "3 of 3 shapes driven drives nothing: AU25_r" in said
+    found = rig.weights_from(load_take(out).weights)
+    torch.testing.assert_close(found, torch.tensor([[1.0, 0.6, 0.6], [0.0, 0.0, 0.0]]))
+
+
+def test_names_that_nothing_knows_are_refused_with_the_flags_that_map_them(tmp_path: Path) -> None:
+    save_rig(performer(texture=False).select(["jawOpen"]), tmp_path / "rig.glb")
+    save_take(Take(30.0, weights=Track(("にやり", "ぺろっ"), torch.ones(2, 2, 1))), tmp_path / "mmd.csv")
+    with pytest.raises(NameMismatchError, match=r"mmd\.csv: .*にやり.*\(--table\) or example poses \(--poses\)"):
+        retarget_weights(tmp_path / "mmd.csv", tmp_path / "rig.glb", WeightFiles(tmp_path / "out.csv"))
 
 
 def test_a_map_is_learned_from_poses_kept_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -116,7 +116,8 @@ def shape_map(
 
     Names that mean the same shape match (``eyeBlinkLeft``, ``eyeBlink_L``), a whole shape drives both of its halves,
     two halves give the whole their mean; see :func:`torchface.shape_names.mapping`. So do other programs' names of
-    ARKit's shapes, MetaHuman's curves, and names to which one rig adds the same everywhere. A name of several shapes
+    ARKit's shapes, MetaHuman's curves, names to which one rig adds the same everywhere, and a source's action units
+    (``AU12``) and morphs of MikuMikuDance. A name of several shapes
     joined by ``_`` or ``+`` (``jawOpen_mouthSmileLeft``), none of them its own in the source, is a combination shape:
     their product.
 
@@ -161,7 +162,7 @@ def shape_map(
     if len(made.undriven) == len(made.to_names):
         raise NameMismatchError(
             f"retarget: found {', '.join(from_names[:5])}, ..., none of which is a shape of {', '.join(to_names[:5])}, "
-            "...; expected common names, or a table that maps them"
+            "...; expected common names, or a table that maps them (--table) or example poses (--poses)"
         )
     return made
 

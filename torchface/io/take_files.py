@@ -17,12 +17,14 @@ from torchface.io.markers.trc import load_trc, save_trc
 from torchface.io.protocols.live_link_recordings import load_live_link_packets
 from torchface.io.tables.csv_table import MAX_TABLE_BYTES, TableReader, quoted
 from torchface.io.tables.numbered_csv import is_numbered
+from torchface.io.weights.action_unit_csv import LARGEST_INTENSITY, is_action_unit_header, load_action_units
 from torchface.io.weights.face_cap_text import is_face_cap, load_face_cap
 from torchface.io.weights.ifacialmocap_text import is_ifacialmocap, load_ifacialmocap
 from torchface.io.weights.json_recordings import load_weight_json
 from torchface.io.weights.live_link_csv import are_live_link_shapes, is_live_link, load_live_link, save_live_link
 from torchface.io.weights.weight_csv import ROTATIONS, load_weights_csv, save_weights_csv
 from torchface.number_checks import checked_path, checked_type
+from torchface.shape_names import is_action_unit
 from torchface.take import Take, Track
 
 MARKER_ENDINGS = (".c3d", ".trc")
@@ -46,13 +48,14 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
     ``frame,time,<label>_x,...``         markers, :func:`torchface.io.markers.marker_csv.load_markers_csv`
     ``frame,time,<shape>,...``           weights, :func:`torchface.io.weights.weight_csv.load_weights_csv`
     ``frame,timestamp,...,x_0,...``      landmarks, :func:`torchface.io.landmarks.openface_csv.load_landmarks_csv`
+    ``frame,timestamp,...,AU01_r,...``   intensities of action units as weights, 0 to 1 in place of 0 to 5
     ``.txt``                             weights of Face Cap (``k,...``) or iFacialMocap (``jawOpen-12|...``)
-    ``.json``                            weights of Audio2Face, or frames of ARKit's face anchors
+    ``.json``                            weights of Audio2Face, frames of ARKit's face anchors or of MediaPipe
     ``.gesichter``                       weights of Live Link Face's packets as they were sent
     ==================================== =====================================================
 
-    A frame in which no marker was seen loads as NaN; :func:`torchface.take.empty_frames` finds it. Weights in percent
-    and rotations in degrees are converted, with a ``UserWarning``.
+    A frame in which no marker was seen loads as NaN; :func:`torchface.take.empty_frames` finds it. Weights in percent,
+    action units from 0 to 5 and rotations in degrees are converted, with a ``UserWarning``.
 
     Args:
         path: the file.
@@ -92,9 +95,11 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
         return in_usual_units(load_weights_csv(path), path)
     if is_landmark_header(header):
         return load_landmarks_csv(path)
+    if is_action_unit_header(header):
+        return load_action_units(path)
     raise FileFormatError(
         f"{path}: found the columns {quoted(header)}; expected Timecode,BlendshapeCount,... or frame,time,... "
-        "or OpenFace's frame,timestamp,...,x_0,..."
+        "or OpenFace's frame,timestamp,... with x_0,... or AU01_r,..."
     )
 
 
@@ -156,6 +161,12 @@ def save_take(take: Take, path: str | Path) -> None:
 
 def in_usual_units(take: Take, path: Path) -> Take:
     """The take with weights from 0 to 1 and rotations in radians; what is converted, a ``UserWarning`` says."""
+    if take.weights is not None and all(map(is_action_unit, take.weights.names)):
+        most = float(take.weights.values.nan_to_num(0.0).max()) if take.weights.values.numel() else 0.0
+        if 1.0 < most <= LARGEST_INTENSITY:
+            _warn(path, f"action units up to {most:.4g}", "0 to 1", "intensities from 0 to 5")
+            scaled = take.weights.values / LARGEST_INTENSITY
+            return replace(take, weights=Track(take.weights.names, scaled, take.weights.confidence))
     if take.weights is not None and (most := _largest(take.weights.values.flatten(1), LARGEST_WEIGHT, _MOST_PERCENT)):
         _warn(path, f"weights up to {most:.4g}", "0 to 1", "percent")
         weights = Track(take.weights.names, take.weights.values / 100, take.weights.confidence)

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from torchface.shape_names.arkit_names import ARKIT, mapping
 from torchface.shape_names.name_tables import METAHUMAN, VRM1
+from torchface.shape_names.pose_names import posed_weights
 
 _PREFIX = re.compile(
     r"^(.*__(?=facs_)|.*(?=Fcl_)(?<!^)|.*[.:|](?=[^.:|]{3,}$)|(?:facs_)?(?:bs|jnt|ctrl|cbs)_|facs_|[at]\d\d_|arkit[_ ]|"
@@ -145,8 +146,8 @@ def recognised_shapes(names: Sequence[str]) -> dict[str, RecognisedShape]:
 
 def recognised_mapping(from_names: Sequence[str], to_names: Sequence[str]) -> Tensor:
     """The matrix (N_to,N_from) of :func:`mapping`, which also matches other programs' names of ARKit's shapes,
-    MetaHuman's curves, and names of a rig whose names all begin or end with something, where ARKit's are among them; to
-    what ``mapping`` leaves alone.
+    MetaHuman's curves, names of a rig whose names all begin or end with something, where ARKit's are among them, and of
+    the source action units and MikuMikuDance's morphs; to what ``mapping`` leaves alone.
 
     Example:
         >>> names = ["Head.jawOpen_Mesh", "Head.eyeBlink_L_Mesh"]
@@ -163,7 +164,11 @@ def recognised_mapping(from_names: Sequence[str], to_names: Sequence[str]) -> Te
             copies[to_curves, ours.index(arkit)] = 1.0
         if from_curves and arkit in theirs:
             copies[theirs.index(arkit), from_curves] = 1 / len(from_curves)
-    for step in (copies, mapping(ours, theirs)):  # of two shapes for one motion the first alone moves
+    steps = [copies, mapping(ours, theirs)]
+    poses = posed_weights(from_names)
+    if poses.any():
+        steps.append(recognised_mapping(ARKIT, to_names) @ poses)
+    for step in steps:  # of two shapes for one motion the first alone moves
         free = ~matrix.any(1, keepdim=True) & ~matrix.any(0, keepdim=True)
         matrix = torch.where(free, step, matrix)
     return matrix

@@ -13,7 +13,9 @@ from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.performance_animation import Performance, performed_glb
 from torchface.io.rig_files import ANIMATION_ENDINGS, SCENE_ENDINGS, load_animation, save_animation
 from torchface.io.scenes.weight_keys import weight_keys, with_correctives
+from torchface.io.tables.csv_table import TableReader
 from torchface.io.take_files import load_take
+from torchface.io.weights.action_unit_csv import is_action_unit_header, load_action_units
 from torchface.io.weights.live_link_csv import not_in_live_link, save_live_link
 from torchface.io.weights.weight_csv import ROTATIONS, save_weights_csv
 from torchface.number_checks import checked_number
@@ -57,8 +59,11 @@ class WeightFiles:
 
 
 def load_weight_take(path: Path) -> Take:
-    """A take that has weights, or an animated rig's file as one."""
-    take = load_animation(path) if path.suffix.lower() in SCENE_ENDINGS else load_take(path)
+    """A take that has weights, or an animated rig's file as one; of OpenFace's table the action units."""
+    ending = path.suffix.lower()
+    if ending == ".csv" and is_action_unit_header(TableReader(path).header):
+        return load_action_units(path)
+    take = load_animation(path) if ending in SCENE_ENDINGS else load_take(path)
     if take is None or take.weights is None:
         raise ValueRangeError(
             f"{path}: found no weights, expected a weight take such as Live Link Face's, or an animated rig"

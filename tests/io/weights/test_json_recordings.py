@@ -1,4 +1,4 @@
-"""JSON recordings: Audio2Face's 52 and 16 of the tongue, and ARKit's face anchors."""
+"""JSON recordings: Audio2Face's 52 and 16 of the tongue, ARKit's face anchors, and MediaPipe's blendshapes."""
 
 import json
 from pathlib import Path
@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 import torch
 from mutation import check_reader
-from recordings_of_phones import TONGUE, audio2face, face_anchors, some_frames
+from recordings_of_phones import TONGUE, audio2face, face_anchors, mediapipe, some_frames
 
 from torchface import load_take
 from torchface.errors import FileFormatError
@@ -36,6 +36,36 @@ def test_face_anchors_keep_weights_rotations_and_times(tmp_path: Path) -> None:
     assert load_take(tmp_path / "list.json").extras.keys() == take.extras.keys()
 
 
+@pytest.mark.parametrize("javascript", [False, True])
+@pytest.mark.filterwarnings("ignore:.*milliseconds")
+def test_mediapipes_blendshapes_keep_weights_times_and_frames_without_a_face(tmp_path: Path, javascript: bool) -> None:
+    weights, _ = some_frames()
+    path = mediapipe(tmp_path / "take.json", weights, javascript)
+    frames = json.loads(path.read_text())
+    frames[2]["faceBlendshapes" if javascript else "face_blendshapes"] = []
+    path.write_text(json.dumps(frames))
+    assert is_weight_json(path)
+    take = load_take(path)
+    assert take.fps == 25
+    assert take.weights.names == tuple(name for name in ARKIT if name != "tongueOut")
+    expected = weights[:, [name != "tongueOut" for name in ARKIT]]
+    expected[2] = torch.nan
+    torch.testing.assert_close(take.weights.values[..., 0], expected, equal_nan=True)
+
+
+def test_categories_alone_are_read_at_30_frames_a_second(tmp_path: Path) -> None:
+    weights, _ = some_frames()
+    frames = json.loads(mediapipe(tmp_path / "take.json", weights).read_text())
+    frames[0]["facial_transformation_matrixes"] = [[[1, 0, 0, 0]] * 4]
+    (tmp_path / "matrix.json").write_text(json.dumps(frames))
+    with pytest.warns(UserWarning, match=r"matrix\.json: the head's motion .* is not read"):
+        load_take(tmp_path / "matrix.json")
+    (tmp_path / "bare.json").write_text(json.dumps([frame["face_blendshapes"][0] for frame in frames]))
+    with pytest.warns(UserWarning, match=r"bare\.json: found no timestamp in its frames; 30 a second are taken"):
+        take = load_take(tmp_path / "bare.json")
+    assert (take.fps, len(take)) == (30, 5)
+
+
 @pytest.mark.parametrize(
     ("document", "found"),
     [
@@ -54,6 +84,9 @@ def test_face_anchors_keep_weights_rotations_and_times(tmp_path: Path) -> None:
         ([{"blendShapes": {"jawOpen": 1}, "timestamp": 0, "transform": [1]}], "expected 16 numbers"),
         ([{"blendShapes": {"jawOpen": 1}, "timestamp": 0}, {"blendShapes": {}, "timestamp": 1}], "of the first frame"),
         ([5], "expected a table"),
+        ([[{"category_name": "wing", "score": 1}]], "expected a category with one of ARKit's names and a score"),
+        ([[{"category_name": "jawOpen", "score": "wide"}]], "score = 'wide', expected a score"),
+        ([[{"category_name": "jawOpen", "score": 1}], 5], "expected MediaPipe's categories"),
     ],
 )
 def test_what_is_no_recording_is_refused(document: object, found: str, tmp_path: Path) -> None:
@@ -75,5 +108,6 @@ def test_a_mutated_recording_is_read_or_refused(tmp_path: Path) -> None:
     seeds = [
         face_anchors(tmp_path / "a.json", weights, rotations),
         audio2face(tmp_path / "b.json", weights, weights[:, :16]),
+        mediapipe(tmp_path / "c.json", weights),
     ]
     check_reader(load_take, seeds, ".json")

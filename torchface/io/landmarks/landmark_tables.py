@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError
-from torchface.io.landmarks.openface_csv import openface_times
 from torchface.io.tables.csv_table import Table, TableReader, quoted
 from torchface.io.tables.frame_rates import numbering_extras
+from torchface.io.tables.numbered_csv import openface_times
 
 COUNTS = (68, 468, 478)  # points a frame: iBUG's landmarks; MediaPipe's mesh without and with irises
 

@@ -1,24 +1,19 @@
 """Landmark takes as CSV in OpenFace's layout: ``frame,timestamp,confidence,success,x_0,...,y_0,...``."""
 
-import warnings
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io.tables.csv_table import TableReader, number_texts, quoted, write_table
-from torchface.io.tables.frame_rates import FrameTimes, frame_numbers
-from torchface.io.tables.numbered_csv import numbered_times
+from torchface.io.tables.frame_rates import frame_numbers
+from torchface.io.tables.numbered_csv import openface_times
 from torchface.io.tables.track_checks import kept_columns, values_to_write
 from torchface.number_checks import check_rate
 from torchface.take import Take, Track
 
-UNKNOWN_RATE = 30.0  # frames a second of landmarks whose video's rate was not known to what found them
-
-_OPENCV_RATE = 1000.0
 _FRAME, _TIME, _CONFIDENCE, _SUCCESS = "frame", "timestamp", "confidence", "success"
 
 
@@ -64,23 +59,6 @@ def load_landmarks_csv(path: str | Path) -> Take:
     track = Track(names, torch.from_numpy(positions), confidence)
     extras |= {"columns": others} if others else {}
     return Take(times.fps, landmarks=track, extras=extras, seconds=times.seconds)
-
-
-def openface_times(numbers: np.ndarray, times: np.ndarray, path: Path) -> tuple[FrameTimes, dict[str, Any]]:
-    """When frames by numbers (T,) and timestamps (T,) are shown, and what to keep of the numbers.
-
-    Where a video's rate varies, OpenCV may say 1,000 frames a second, and OpenFace writes timestamps by it: then the
-    rate is unknown, and :data:`UNKNOWN_RATE` is taken, with a ``UserWarning``.
-    """
-    found, extras = numbered_times(numbers, times, path, first=1)
-    if found.fps != _OPENCV_RATE:
-        return found, extras
-    warnings.warn(
-        f"{path}: found {_OPENCV_RATE:g} frames a second, which OpenCV says of videos whose rate it does not know, "
-        f"expected a camera's; {UNKNOWN_RATE:g} are taken",
-        stacklevel=3,
-    )
-    return numbered_times(numbers, numbers / UNKNOWN_RATE, path, first=1)
 
 
 def save_landmarks_csv(take: Take, path: str | Path) -> None:

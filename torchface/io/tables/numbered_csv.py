@@ -1,5 +1,6 @@
 """The plain CSV layout ``frame,time,<channel>,...``: one row a frame, times in seconds, an empty cell not seen."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,9 @@ from torchface.number_checks import check_rate
 from torchface.take import Take
 
 COLUMNS = ("frame", "time")
+UNKNOWN_RATE = 30.0  # frames a second of landmarks whose video's rate was not known to what found them
+
+_OPENCV_RATE = 1000.0
 
 
 def is_numbered(header: Sequence[str]) -> bool:
@@ -47,6 +51,23 @@ def numbered_times(numbers: np.ndarray, times: np.ndarray, path: Path, first: in
         raise FileFormatError(f"{path}: frame {row + 1}: found no frame number or no time, expected both in every row")
     extras = numbering_extras(numbers, first, str(path))
     return frame_times(times, TimeSource(file_error(path), numbers)), extras
+
+
+def openface_times(numbers: np.ndarray, times: np.ndarray, path: Path) -> tuple[FrameTimes, dict[str, Any]]:
+    """When frames by numbers (T,) and timestamps (T,) are shown, and what to keep of the numbers.
+
+    Where a video's rate varies, OpenCV may say 1,000 frames a second, and OpenFace writes timestamps by it: then the
+    rate is unknown, and :data:`UNKNOWN_RATE` is taken, with a ``UserWarning``.
+    """
+    found, extras = numbered_times(numbers, times, path, first=1)
+    if found.fps != _OPENCV_RATE:
+        return found, extras
+    warnings.warn(
+        f"{path}: found {_OPENCV_RATE:g} frames a second, which OpenCV says of videos whose rate it does not know, "
+        f"expected a camera's; {UNKNOWN_RATE:g} are taken",
+        stacklevel=3,
+    )
+    return numbered_times(numbers, numbers / UNKNOWN_RATE, path, first=1)
 
 
 def write_numbered(

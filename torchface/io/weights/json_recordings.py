@@ -1,5 +1,7 @@
-"""JSON recordings of weights: Audio2Face's export, and ARKit's face anchors as apps write them."""
+"""JSON recordings of weights: Audio2Face's export, ARKit's face anchors, and MediaPipe's blendshapes."""
 
+import warnings
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,15 +11,21 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError
 from torchface.files.documents import Value, read_json
-from torchface.io.tables.frame_rates import TimeSource, file_error, frame_times
+from torchface.io.tables.frame_rates import FrameTimes, TimeSource, file_error, frame_times
+from torchface.io.tables.numbered_csv import UNKNOWN_RATE
 from torchface.io.weights.arkit_values import arkit_row
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.number_checks import check_rate
+from torchface.shape_names import ARKIT
 from torchface.take import Take, Track
 
 _MAX_BYTES = 2**27
 _MOST_SHAPES, _MOST_FRAMES = 1000, 2**20
 _LARGEST = 1e4
+_CATEGORIES = ("face_blendshapes", "faceBlendshapes", "blendshapes", "categories")
+_TIMES = ("timestamp_ms", "timestampMs", "timestamp", "time")
+_MATRICES = ("facial_transformation_matrixes", "facialTransformationMatrixes")
+_NEUTRAL = "_neutral"  # MediaPipe's first category, which is no shape
 
 
 def is_weight_json(path: str | Path) -> bool:
@@ -26,15 +34,22 @@ def is_weight_json(path: str | Path) -> bool:
     if isinstance(document, dict) and "weightMat" in document:
         return True
     frames = document.get("frames") if isinstance(document, dict) else document
-    return isinstance(frames, list) and bool(frames) and isinstance(frames[0], dict) and "blendShapes" in frames[0]
+    if isinstance(document, dict) and frames is None:
+        frames = [document]
+    if not isinstance(frames, list) or not frames:
+        return False
+    return _is_anchor(frames[0]) or any(map(_are_categories, frames))
 
 
 def load_weight_json(path: str | Path) -> Take:
-    """Reads Audio2Face's export (``facsNames``, ``weightMat``, ``exportFps``) or frames of ARKit's face anchors.
+    """Reads Audio2Face's export (``facsNames``, ``weightMat``, ``exportFps``), frames of ARKit's face anchors, or of
+    MediaPipe's Face Landmarker.
 
-    Those are a list, or a table with the list ``frames``; each frame has ``timestamp`` in seconds, ``blendShapes`` with
-    numbers by ARKit's names and, where the app wrote them, ``transform``, ``leftEyeTransform`` and
-    ``rightEyeTransform``: 16 numbers by columns, or four columns of four.
+    Frames are a list, or a table with the list ``frames``. Those of face anchors have ``timestamp`` in seconds,
+    ``blendShapes`` with numbers by ARKit's names and, where the app wrote them, ``transform``, ``leftEyeTransform`` and
+    ``rightEyeTransform``: 16 numbers by columns, or four columns of four. Those of MediaPipe are a result as it is
+    printed in Python or JavaScript, or its categories alone (``category_name``, ``score``); of several faces the first
+    counts, a frame without one is NaN, and without times there are 30 frames a second, with a ``UserWarning``.
 
     Returns:
         weights (T,N,1), names as the file spells them, such as Audio2Face's 52 and 16 of the tongue; rotations in
@@ -44,9 +59,76 @@ def load_weight_json(path: str | Path) -> Take:
     if isinstance(document.found, dict) and "weightMat" in document.found:
         return _audio2face(document)
     frames = document["frames"] if isinstance(document.found, dict) else document
-    if not isinstance(frames.found, list) or not frames.found:
-        raise document.error("Audio2Face's facsNames and weightMat, or a list of frames with blendShapes")
+    if isinstance(document.found, dict) and not frames:
+        frames = replace(document, found=[document.found])
+    if isinstance(frames.found, list) and any(map(_are_categories, frames.found)):
+        return _mediapipe(frames)
+    if not isinstance(frames.found, list) or not frames.found or frames.found == [{}]:
+        raise document.error(
+            "Audio2Face's facsNames and weightMat, or a list of frames with blendShapes, or with MediaPipe's categories"
+        )
     return _face_anchors(frames)
+
+
+def _is_anchor(frame: object) -> bool:
+    return isinstance(frame, dict) and "blendShapes" in frame
+
+
+def _categories(frame: object) -> list[dict[str, Any]] | None:
+    """The categories of the first face of MediaPipe's result, empty where it has none; None where it is no result."""
+    while True:
+        if isinstance(frame, dict):
+            frame = next((frame[key] for key in _CATEGORIES if key in frame), None)
+        elif isinstance(frame, list) and frame and isinstance(frame[0], dict) and _score_name(frame[0]) is not None:
+            return frame
+        elif isinstance(frame, list):
+            if not frame:
+                return []
+            frame = frame[0]
+        else:
+            return None
+
+
+def _are_categories(frame: object) -> bool:
+    return bool(_categories(frame))
+
+
+def _score_name(category: dict[str, Any]) -> str | None:
+    """A category's name; None where it is none."""
+    name = category.get("category_name") or category.get("categoryName")
+    return name if isinstance(name, str) and "score" in category else None
+
+
+def _mediapipe(frames: Value) -> Take:
+    rows = frames.rows(1, _MOST_FRAMES, f"1 to {_MOST_FRAMES} frames")
+    weights = np.full((len(rows), len(ARKIT)), np.nan, np.float32)
+    seen: set[int] = set()
+    for i, row in enumerate(rows):
+        categories = _categories(row.found)
+        if categories is None:
+            raise row.error("MediaPipe's categories, each with category_name and score")
+        for category in replace(row, found=categories).rows():
+            name = _score_name(category.found) if isinstance(category.found, dict) else None
+            column = None if name is None else arkit_row(name)
+            if column is None and name != _NEUTRAL:
+                raise category.error("a category with one of ARKit's names and a score")
+            if column is not None:
+                weights[i, column] = category["score"].number("a score", _LARGEST)
+                seen.add(column)
+    if any(isinstance(row.found, dict) and any(map(row.found.get, _MATRICES)) for row in rows):
+        warnings.warn(f"{frames.source}: the head's motion (facial transformation matrices) is not read", stacklevel=4)
+    known = sorted(seen)
+    key = next((key for key in _TIMES if isinstance(rows[0].found, dict) and key in rows[0].found), None)
+    if key is None:
+        warnings.warn(
+            f"{frames.source}: found no timestamp in its frames; {UNKNOWN_RATE:g} a second are taken", stacklevel=4
+        )
+        timing = FrameTimes(UNKNOWN_RATE, None)
+    else:
+        times = np.array([row[key].number("a time") for row in rows]) / (1000.0 if key.lower().endswith("ms") else 1.0)
+        timing = frame_times(times, TimeSource(file_error(frames.source)))
+    track = Track(tuple(ARKIT[column] for column in known), torch.from_numpy(weights[:, known])[..., None])
+    return Take(timing.fps, weights=track, seconds=timing.seconds)
 
 
 def _audio2face(document: Value) -> Take:
