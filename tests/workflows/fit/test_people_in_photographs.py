@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -147,3 +148,19 @@ def test_exact_landmarks_of_one_head_are_of_one_person() -> None:
 
     alone = [bare(marks[i : i + 1], [i]) for i in range(3)]
     assert one_person_lines([Path(f"{i}.png") for i in range(3)], marks, alone, bare) == []
+
+
+def test_like_heads_with_other_hair_and_lips_are_warned_of_and_not_refused() -> None:
+    eye, one = torch.eye(3), torch.tensor([0.5, -1.0, 1.5])
+    fit = SimpleNamespace(coefficients=one, covariance=0.02 * eye, errors=torch.ones(1), landmarks=torch.rand(1, 68, 2))
+    names, marks = [Path("a.png"), Path("b.png")], torch.rand(2, 68, 2)
+    like = torch.tensor([[-2.0, -1.5, 0.3, -0.1]]).double().expand(2, 4)
+    other = torch.stack([like[0], torch.tensor([-0.3, -0.4, 0.0, 0.3]).double()])
+
+    def lines(colors: Tensor | None) -> list[str]:
+        return one_person_lines(names, marks, [fit, fit], lambda *_: fit, colors=colors)
+
+    assert lines(None) == lines(like) == []
+    (line,) = lines(other)
+    assert "may show different people" in line
+    assert "with the colours of hair, brows and lips a.png" in line

@@ -10,6 +10,7 @@ from torchface.errors import AlignmentError
 from torchface.landmarks import NoFaceError
 from torchface.modeling import FitSettings, HeadModel, ImageFit
 from torchface.modeling.photographs.landmark_view import JAW
+from torchface.workflows.fit.color_evidence import color_evidence
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, find_in_photographs
 
 MISFIT = 0.045
@@ -17,12 +18,17 @@ MISFIT = 0.045
 of people at most 2.4 % without the contour."""
 
 ONE_PERSON, OTHERS = 0.95, 0.25
-"""Probabilities: photographs above the first show one person, those below the second are refused.
+"""Probabilities: photographs above the first show one person, those whose heads' form has less than the second are
+refused.
 
-Of 39 pairs of photographs of one person each all were above 0.97 (68 landmarks, the modes of ICT-FaceKit). Of 9 pairs
-with found landmarks all were above 0.96 with those modes, but three of turned heads 0.38 to 0.45 with the zoo's
-``head``; of 244 pairs of two people 38 and 34 % are below 0.25, 57 and 54 % below 0.95: nothing distinguishes the rest.
+Form and colours together, of pairs of found landmarks in 14 rendered people and 24 real ones: of 364 and 1,321 pairs
+of two people 13 and 12 % are above the first with the zoo's ``head`` (43 and 25 % by form alone), 2 and 13 % with ICT's
+modes (3 and 27 %); of 14 and 48 pairs of one, 4 and 24 are below it with ``head`` (6 and 25 by form alone), 3 and 1
+with ICT's (8 and 20). Those 48 are of three people.
 """
+
+FORM_SAYS = 4.0
+"""Most that like heads speak for one person, a logarithm of odds: other people have such heads too."""
 
 ALONE = FitSettings(transfers=0, unknown_deviation=0.0, least_noise=0.004)
 """How heads are fitted for these checks, whose limits are of such fits: nothing but the model explains a head. Exact
@@ -88,20 +94,27 @@ def one_person_lines(
     bare: BareFit,
     insist: bool = False,
     expected: float = ONE_PERSON,
+    colors: Tensor | None = None,
 ) -> list[str]:
     """Whether photographs that were fitted together show one person, for people to read; nothing if that is as
-    likely as expected. Each is fitted alone too."""
+    likely as expected. Each is fitted alone too; colours (I,4), see ``part_colors``, only lead to a warning."""
     if len(photographs) < 2:
         return []
-    sure = same_person(alone).sigmoid()
-    worst = int(sure.argmin())
-    if float(sure[worst]) >= expected:
+    form = same_person(alone)
+    sure = form.sigmoid()
+    both = sure if colors is None else (form.clamp(max=FORM_SAYS) + color_evidence(colors)).sigmoid()
+    if float(both.min()) >= expected and float(sure.min()) >= OTHERS:
         return []
+    worst = int(sure.argmin())
     joint = float(misfits(bare(marks, list(range(len(marks))))).square().mean().sqrt())
     each = float(torch.stack([misfits(fit)[0] for fit in alone]).square().mean().sqrt())
-    listed = ", ".join(f"{path.name} {share:.0%}" for path, share in zip(photographs, sure.tolist(), strict=True))
+    listed, with_colors = (
+        ", ".join(f"{path.name} {share:.0%}" for path, share in zip(photographs, shares.tolist(), strict=True))
+        for shares in (sure, both)
+    )
+    colored = "" if colors is None else f", with the colours of hair, brows and lips {with_colors}"
     figures = (
-        f"probability that each shows the person of the others, by the form of the heads alone: {listed}, expected "
+        f"probability that each shows the person of the others, by the form of the heads {listed}{colored}, expected "
         f"above {expected:.0%}; landmarks lie {joint:.1%} of the eyes' distance from one head "
         f"for all, {each:.1%} from a head for each"
     )

@@ -30,6 +30,7 @@ from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.embedded_character import is_performers
 from torchface.viz.figures.landmark_dots import with_dots
+from torchface.workflows.fit.color_evidence import part_colors
 from torchface.workflows.fit.fit_checks import (
     ALONE,
     ONE_PERSON,
@@ -244,7 +245,8 @@ def fit_photographs(
     remarks += width_lines(photographs, alone, heads, rig.neutral.landmarks)
     # The tracker has followed one face through a film.
     expected = OTHERS if one_film else ONE_PERSON
-    remarks += one_person_lines(photographs, marks, alone, bare, insist or one_film, expected)
+    colors = None if one_film else torch.stack([part_colors(*one) for one in zip(images, parts, strict=True)])
+    remarks += one_person_lines(photographs, marks, alone, bare, insist or one_film, expected, colors)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)
     remarks += profile_lines(fit)
     if found:
