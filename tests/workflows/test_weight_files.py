@@ -164,13 +164,13 @@ def test_missing_weights_are_told_by_every_command(
     assert told in said()
     rig = str(stage / "arkit.glb")
     for command in (
-        ["retarget", str(file), "--to", rig],
-        ["evaluate", str(file), str(file), "--rig", rig],
-        ["render", rig, "--take", str(file)],
-        ["demo", "--take", str(file)],
+        ["retarget", str(file), "--to", rig, "--out", str(tmp_path / "out.csv")],
+        ["evaluate", str(file), str(file), "--rig", rig, "--out", str(tmp_path / "out")],
+        ["render", rig, "--take", str(file), "--out", str(tmp_path / "out.png")],
+        ["demo", "--take", str(file), "--out", str(tmp_path / "out")],
     ):
         with pytest.raises(SystemExit):
-            main([*command, "--out", str(tmp_path / "out.png" if "render" in command else tmp_path / "out.csv"), "-q"])
+            main([*command, "-q"])
         assert told in said()
         assert {path.name for path in tmp_path.iterdir()} == {"gaps.csv"}
     values[0] = torch.nan  # no face, which is no fault
