@@ -59,6 +59,37 @@ def test_a_scans_texture_shows_its_eyes(rig: BlendshapeRig, blink: float, taken:
         assert re.search(note, notes[0])
 
 
+@pytest.mark.parametrize(("left", "right", "taken", "note"), [
+    (1.0, 0.0, (0.0, 0.0), "scan's left eye is shut, .* taken as open: --pose eyeBlinkLeft=1 gives"),
+    (0.0, 0.0, (1.0, 0.0), "scan's left eye is open, .* taken as shut: leave out --pose eyeBlinkLeft=1$"),
+    (1.0, 1.0, (1.0, 0.0), "scan's right eye is shut, .*: --pose eyeBlinkLeft=1 eyeBlinkRight=1 gives"),
+    (1.0, 0.0, (0.0, 1.0), "left eye is shut, .* right eye is open, .*: --pose eyeBlinkLeft=1 gives"),
+    (0.0, 1.0, (0.0, 1.0), ""),
+])  # fmt: skip
+@pytest.mark.parametrize("colored", [True, False])
+def test_each_eye_is_judged_for_itself(
+    rig: BlendshapeRig, left: float, right: float, taken: tuple[float, float], note: str, colored: bool
+) -> None:
+    def pose(left: float, right: float) -> Tensor:
+        shown = torch.zeros(len(rig.names))
+        shown[[rig.names.index("eyeBlinkLeft"), rig.names.index("eyeBlinkRight")]] = torch.tensor([left, right])
+        return shown
+
+    def fitted(shown: Tensor) -> Registration:
+        """Lids in another pose lie half as far off as they are apart."""
+        apart = (rig(shown[None]) - rig(pose(left, right)[None]))[0].detach().norm(dim=-1)
+        return exact(plain, 0.5 * apart + 0.1)
+
+    scan = rig.neutral.with_vertices(rig(pose(left, right)[None])[0].detach())
+    plain = replace(scan, texture=None, colors=None)
+    found = fitted(pose(*taken)) if not colored else exact(plain, torch.zeros(len(scan.vertices)))
+    second = no_second_fit if colored else fitted
+    notes = with_eye_note(rig, scan if colored else plain, found, pose(*taken), second).record.notes
+    assert len(notes) == bool(note)
+    if note:
+        assert re.search(note, notes[0])
+
+
 @pytest.mark.parametrize(("open_fit", "shut_fit", "shut"), [(0.27, 0.08, True), (0.1, 0.7, False), (0.1, 0.1, False)])
 def test_without_colours_two_fits_say_which_lids_they_are(
     rig: BlendshapeRig, open_fit: float, shut_fit: float, shut: bool

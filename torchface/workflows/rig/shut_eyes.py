@@ -23,13 +23,14 @@ from torchface.viz.figures.face_views import frame_face
 from torchface.workflows.named_finders import load_finder
 from torchface.workflows.rig.character_face import CharacterFace
 
-_BLINKS = ("eyeBlinkLeft", "eyeBlinkRight")
+_BLINKS, _SIDES = ("eyeBlinkLeft", "eyeBlinkRight"), ("left", "right")
 # Likelihoods of the eye network: 0.9 and more of shut eyes, 0.08 at most of open and half shut ones.
 _SHUT, _OPEN, _LEAST_PRESENCE = 0.6, 0.3, 0.9
 _LIDS = 2.0  # millimetres that a blink moves skin of the lids
-# Mean distance of the lids in the fit with shut eyes over that with open ones: 0.07 to 0.35 where they are shut, 1.6
-# and more where they are open.
-_BETTER, _WORSE = 0.6, 1.6
+# Mean distance of an eye's lids in the fit with shut eyes over that with open ones: with ICT's template 0.07 to 0.35
+# where they are shut, 1.6 and more where they are open; with the performer's, on ICT's heads, 0.59 to 1.15 where they
+# are shut and 0.42 to 1.92 where they are open, which says little.
+_BETTER, _WORSE = 0.4, 1.6
 _WIDTH, _HEIGHT = 480, 600
 _BLINKS_OF = ("Right", "Left")  # in the order of iBUG's eyes
 _BALL, _HIDDEN = 2.6, 0.75  # radii of a reference's eyeball; the share of a ball's front that skin covers
@@ -43,29 +44,32 @@ def with_eye_note(
     shown: Tensor,
     other_fit: Callable[[Tensor], Registration],
 ) -> Registration:
-    """The registration, with a note where the scan's eyes are shut though taken as open, or open though taken as shut.
+    """The registration, with a note of each eye of the scan that is shut though taken as open, or the other way.
 
     The scan's face is drawn from the front and the eye network looks at it; where the scan has no colours, or they do
     not show a face, the template is registered once more with its lids the other way.
     """
-    rows = mapping(rig.names, _BLINKS) > 0.5
-    if not bool(rows.any(1).all()):
+    blinks = mapping(rig.names, _BLINKS) > 0.5
+    if not bool(blinks.any(1).all()):
         return registration
-    blink = rows.any(0)
-    taken_shut = bool((shown[blink] > 0.5).all())
+    taken = [bool((shown[blink] > 0.5).all()) for blink in blinks]
     found, how = _by_texture(scan, registration, rig), "the eye network sees"
     if found is None:
-        found, how = _by_shape(rig, registration, blink, shown, other_fit, taken_shut), "the lids' shape says"
-    if found is None or found == taken_shut:
+        found, how = _by_shape(rig, registration, blinks, shown, other_fit, taken), "the lids' shape says"
+    shut = [was if saw is None else saw for was, saw in zip(taken, found, strict=True)]
+    poses = [f"{rig.names[i]}=1" for i in blinks[torch.tensor(shut)].any(0).nonzero()[:, 0].tolist()]
+    notes = []
+    for state, (is_now, was_taken) in ((True, ("shut", "open")), (False, ("open", "shut"))):
+        wrong = [i for i in range(2) if shut[i] == state != taken[i]]
+        if wrong:
+            eyes = "eyes are" if len(wrong) == 2 else f"{_SIDES[wrong[0]]} eye is"
+            notes.append(f"the scan's {eyes} {is_now}, as {how}, and taken as {was_taken}")
+    if not notes:
         return registration
-    pose = " ".join(f"{rig.names[i]}=1" for i in blink.nonzero()[:, 0].tolist())
-    note = (
-        f"the scan's eyes are shut, as {how}, and were taken as open: --pose {pose} gives a neutral with open eyes"
-        if found
-        else f"the scan's eyes are open, as {how}, and were taken as shut: leave out --pose {pose}"
-    )
+    given = " ".join(f"{rig.names[i]}=1" for i in (blinks.any(0) & (shown > 0.5)).nonzero()[:, 0].tolist())
+    cure = f"--pose {' '.join(poses)} gives a neutral with open eyes" if poses else f"leave out --pose {given}"
     record = registration.record
-    return replace(registration, record=replace(record, notes=(*record.notes, f"warning: {note}")))
+    return replace(registration, record=replace(record, notes=(*record.notes, f"warning: {'; '.join(notes)}: {cure}")))
 
 
 def eyes_shut_at_rest(face: CharacterFace, reference: Mesh) -> tuple[bool, bool]:
@@ -110,8 +114,8 @@ def with_shut_eyes(rig: BlendshapeRig, shut: tuple[bool, bool]) -> BlendshapeRig
     return BlendshapeRig(rig.neutral.with_vertices(vertices), deltas, rig.names)
 
 
-def _by_texture(scan: Mesh, registration: Registration, rig: BlendshapeRig) -> bool | None:
-    """Whether both eyes are shut in the scan's colours; None where these do not tell."""
+def _by_texture(scan: Mesh, registration: Registration, rig: BlendshapeRig) -> list[bool | None] | None:
+    """Whether each eye is shut in the scan's colours, None where it is between; None where they show no face."""
     marks = registration.mesh.landmarks if _has_68(registration.mesh) else None
     false = any("colours are not a face's" in note for note in registration.record.notes)
     if marks is None or false or not has_colors(scan):
@@ -125,29 +129,33 @@ def _by_texture(scan: Mesh, registration: Registration, rig: BlendshapeRig) -> b
     reading = settled_face(load_finder().finder, picture, box, 0.0)
     if float(reading.presence) < _LEAST_PRESENCE or not bool(torch.isfinite(reading.closed).all()):
         return None
-    if bool((reading.closed > _SHUT).all()):
-        return True
-    return False if bool((reading.closed < _OPEN).all()) else None
+    sides = [1, 0]  # the network's eyes are iBUG's, the right one first
+    return [True if one > _SHUT else False if one < _OPEN else None for one in reading.closed[sides].tolist()]
 
 
 def _by_shape(
     rig: BlendshapeRig,
     registration: Registration,
-    blink: Tensor,
+    blinks: Tensor,
     shown: Tensor,
     other_fit: Callable[[Tensor], Registration],
-    taken_shut: bool,
-) -> bool | None:
-    """Whether the fit with shut eyes is the better one at the lids; None where both are as good."""
-    lids = rig.deltas[blink].detach().norm(dim=2).amax(0) > _LIDS
-    lids = lids.to(registration.distance.device)
+    taken: list[bool],
+) -> list[bool | None]:
+    """Whether the fit with a shut eye is the better one at its lids; None where both are as good."""
+    other_way = shown.clone()
+    for blink, was_shut in zip(blinks, taken, strict=True):
+        other_way[blink] = 0.0 if was_shut else 1.0
     try:
-        other = other_fit(torch.where(blink, 0.0 if taken_shut else 1.0, shown))
+        other = other_fit(other_way)
     except TorchfaceError:  # what cannot be registered with other lids says nothing
-        return None
-    shut, open_ = (registration, other) if taken_shut else (other, registration)
-    ratio = float(shut.distance[lids].mean() / open_.distance[lids].mean().clamp(min=1e-6))
-    return True if ratio < _BETTER else False if ratio > _WORSE else None
+        return [None, None]
+    found: list[bool | None] = []
+    for blink, was_shut in zip(blinks, taken, strict=True):
+        lids = (rig.deltas[blink].detach().norm(dim=2).amax(0) > _LIDS).to(registration.distance.device)
+        shut, open_ = (registration, other) if was_shut else (other, registration)
+        ratio = float(shut.distance[lids].mean() / open_.distance[lids].mean().clamp(min=1e-6))
+        found.append(True if ratio < _BETTER else False if ratio > _WORSE else None)
+    return found
 
 
 def _has_68(mesh: Mesh) -> bool:
