@@ -1,5 +1,6 @@
 """What ``torchface info`` says of a take's markers: their extent in millimetres, and the file's unit."""
 
+import shlex
 from pathlib import Path
 
 import numpy as np
@@ -71,8 +72,10 @@ def test_folders_that_are_no_rigs_say_what_they_are(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"found a folder with 1: a\.glb, expected a file, such as .*a\.glb"):
         describe(tmp_path)
     (tmp_path / "model.toml").touch()
-    with pytest.raises(FileFormatError, match=r"found a learned model, .*zoo describe"):
-        describe(tmp_path)
+    model = tmp_path.rename(tmp_path.with_name("my model's"))
+    with pytest.raises(FileFormatError, match="found a learned model, expected a rig; ") as refused:
+        describe(model)
+    assert shlex.split(str(refused.value).split("`")[1]) == ["torchface", "zoo", "describe", str(model)]
 
 
 def test_a_head_of_two_metres_and_a_texture_that_is_not_read_are_said(tmp_path: Path) -> None:
@@ -94,3 +97,16 @@ def test_a_head_of_two_metres_and_a_texture_that_is_not_read_are_said(tmp_path: 
 def test_what_is_not_there_is_told_before_its_ending(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match="found no such file"):
         describe(tmp_path / "nothing")
+
+
+@pytest.mark.parametrize("typed", ["'{}'", '"{}"', "{escaped}", "file:{}", " {} "])
+def test_a_path_as_a_shell_would_have_read_it_is_suggested(tmp_path: Path, typed: str) -> None:
+    there = tmp_path / "my takes (2)" / "a b.c3d"
+    there.parent.mkdir()
+    there.touch()
+    escaped = str(there).replace(" ", r"\ ").replace("(", r"\(").replace(")", r"\)")
+    with pytest.raises(FileFormatError, match="found no such file") as refused:
+        describe(Path(typed.format(there, escaped=escaped)))
+    assert str(refused.value).endswith(f"; did you mean {shlex.quote(str(there))}?")
+    with pytest.raises(FileFormatError, match=r"expected an existing one$"):
+        describe(Path(f"'{there}x'"))

@@ -16,7 +16,7 @@ from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from tyro.constructors import PrimitiveConstructorSpec
 
 from torchface.cli.terminal import console
-from torchface.errors import FileFormatError
+from torchface.files.whole_files import check_there
 
 _PATTERN = re.compile(r"[{}*?%\[\]]|:/")  # of a placeholder, of several files, or of an address
 _WORDS = {Path: "PATH", str: "TEXT", int: "NUMBER", float: "NUMBER"}
@@ -73,8 +73,8 @@ def _check_inputs(command: Callable[..., Any], values: Mapping[str, Any]) -> Non
         if _output(name, hints[name]) is not None:
             continue
         for path in paths:
-            if isinstance(path, Path) and not path.exists() and not _PATTERN.search(str(path)):
-                raise FileFormatError(f"{path}: found no such file or folder, expected an existing one")
+            if isinstance(path, Path) and not _PATTERN.search(str(path)):
+                check_there(path, "file or folder")
 
 
 def inputs_kept(command: Callable[..., Any], values: Mapping[str, Any]) -> AbstractContextManager[None]:

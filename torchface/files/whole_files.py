@@ -10,6 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
+from shlex import quote
 
 from torchface.errors import FileFormatError
 from torchface.files.input_files import check_no_input, note_read
@@ -24,10 +25,14 @@ _writes: dict[Path, int] = {}
 _waiting: ContextVar[list[tuple[Path | None, Path]] | None] = ContextVar("waiting", default=None)
 
 
-def check_there(path: Path) -> None:
+def check_there(path: Path, what: str = "file") -> None:
     """Raises ``FileFormatError`` where there is no file or folder, before its ending is judged."""
     if not path.exists():
-        raise FileFormatError(f"{path}: found no such file, expected an existing one")
+        # As it is typed, where a program or a page that hands it over takes no quotes and escapes away as a shell does.
+        bare = re.sub(r"""\\(?=[ ()&'"])""", "", str(path).strip()).strip("'\"").removeprefix("file:")
+        meant = Path(bare).expanduser()
+        hint = f"; did you mean {quote(str(meant))}?" if meant != path and meant.exists() else ""
+        raise FileFormatError(f"{path}: found no such {what}, expected an existing one{hint}")
 
 
 def numbered_order(path: Path) -> list[tuple[int, int, str]]:
@@ -39,8 +44,7 @@ def numbered_order(path: Path) -> list[tuple[int, int, str]]:
 def checked_size(path: Path, largest: int = LARGEST_FILE) -> int:
     """Bytes of a plain file that is there, not empty and not beyond reason."""
     try:
-        if not path.exists():
-            raise FileFormatError(f"{path}: found no such file, expected an existing one")
+        check_there(path)
         if not path.is_file():
             raise FileFormatError(f"{path}: found a folder or a device, expected a plain file")
         size = path.stat().st_size

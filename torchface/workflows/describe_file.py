@@ -147,8 +147,7 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
         ".onnx",
         ".toml",
     )
-    if not suffix:
-        check_there(path)
+    check_there(path)
     raise FileFormatError(
         f"{path}: found the ending {suffix!r}, expected a folder or one of {' '.join(sorted(endings))}"
     )

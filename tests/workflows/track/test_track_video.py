@@ -1,6 +1,7 @@
 """A filmed performer comes back as weights; what cannot be tracked is told."""
 
 import json
+import shlex
 import shutil
 import warnings
 from dataclasses import replace
@@ -112,9 +113,13 @@ def test_what_cannot_be_tracked_is_told_and_leaves_nothing(
     filmed: Filmed, dome_rig: BlendshapeRig, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    save_rig(dome_rig, tmp_path / "dome.glb")
-    with pytest.raises(ValueRangeError, match=r"dome.glb: found no landmark vertices, expected the 68"):
-        track_video(filmed.video, tmp_path / "dome.glb", out, QUICK)
+    dome = tmp_path / "my dome's (2).glb"
+    save_rig(dome_rig, dome)
+    with pytest.raises(ValueRangeError, match=r"\(2\)\.glb: found no landmark vertices, expected the 68") as refused:
+        track_video(filmed.video, dome, out, QUICK)
+    advised = str(refused.value).split("torchface ")
+    assert shlex.split(advised[1].split(" finds")[0]) == ["rig", str(dome), "--out", "NEW.glb"]
+    assert shlex.split(advised[3].split(" carries")[0])[2:4] == ["--to", str(dome)]
     (tmp_path / "junk.mp4").write_bytes(b"\0\0\0\x18ftypmp42" + bytes(200))
     with pytest.raises(FileFormatError, match=r"junk.mp4"):
         track_video(tmp_path / "junk.mp4", filmed.rig, out, QUICK)
