@@ -89,6 +89,27 @@ def test_pictures_that_are_not_plain_photographs(change: Callable[[Tensor], Tens
     assert any(line in one and one.startswith("WARNING: a.png: ") for one in lines), lines
 
 
+@pytest.mark.parametrize(
+    ("eyes", "hair", "line"),
+    [
+        ((0.8, 0.72, 0.7), (0.15, 0.13, 0.1), None),
+        ((0.8, 0.72, 0.78), (0.15, 0.13, 0.1), "whites of eyes that are violet or blue (blue 1.08 of green)"),
+        ((0.8, 0.72, 0.7), (0.15, 0.18, 0.18), "dark hair that is greenish (red 0.84 of green)"),
+    ],
+)
+def test_whites_of_eyes_and_hair_say_what_skin_does_not(
+    eyes: tuple[float, ...], hair: tuple[float, ...], line: str | None
+) -> None:
+    image, parts = skin(), bare()
+    for rows, name, color in ((slice(90, 96), "eyes", eyes), (slice(0, 20), "hair", hair)):
+        image[:, rows] = torch.tensor(color)[:, None, None]
+        parts.shares[:, rows] = 0
+        parts.shares[PARTS.index(name), rows] = 1
+    lines = color_lines(Path("a.png"), image, parts, reading().landmarks)
+    assert len(lines) == (line is not None)
+    assert line is None or line in lines[0]
+
+
 def test_hidden_and_small_faces() -> None:
     face = reading()
     behind = replace(face, eye_visibility=torch.tensor([0.1, 0.05]))

@@ -30,6 +30,10 @@ _RIVAL = 0.5  # of the chosen face's area: another that large may be the one tha
 # Logarithms of skin's colour, medians: the mean of red and blue over green, and blue over red. 32 faces in 13 pictures
 # 0.00 to 0.16 and -0.80 to -0.23; on a toned poster -0.25 and -1.8.
 _GREEN_CAST, _RED_CAST = (-0.12, 0.20), (-1.2, -0.18)
+# Logarithms of colours: blue over green of the brighter whites of eyes, of 33 faces at most 0.02, and red over green of
+# the darker hair and brows, at least -0.06; a quantile of their brightness, and pixels.
+_VIOLET_WHITES, _WHITES, _FEW_WHITES = 0.05, 0.6, 10
+_TEAL_HAIR, _DARK_HAIR, _FEW_HAIRS, _HAIR = -0.10, 0.4, 30, 0.7
 # Standard deviation of skin's hue where it varies least: those faces at least 0.017 (also small, blurred, compressed),
 # 13 of 17 rendered ones at most 0.0125.
 _ONE_HUE, _BLOTCHES = 0.0135, 0.017
@@ -227,7 +231,7 @@ def color_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Te
         if flat > _FLAT_GREY:
             lines.insert(0, f"{flat:.0%} of the face without grain, which photographs have: a drawing, a statue?")
     else:
-        lines = _hue_lines(skin)
+        lines = [*_hue_lines(skin), *_filter_lines(image, parts)]
     steps = _steps(image, marks)
     if len(steps) >= _FEWEST:
         usual, strong = steps.quantile(steps.new_tensor([0.5, 0.95])).tolist()
@@ -261,6 +265,26 @@ def _hue_lines(skin: Tensor) -> list[str]:
             f"colours that skin has not in white light (red {red_share:.2f} and blue {blue_share:.2f} of green): "
             f"a filter, coloured light, paint?"
         )
+    return lines
+
+
+def _filter_lines(image: Tensor, parts: FaceParts) -> list[str]:
+    """What colours of eyes' whites and of hair say of a filter, for people to read."""
+    crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), parts.transform, parts.shares.shape[-1]).double() / 255
+    eyes, hair = (crop[:, share] for share in (parts.of("eyes") > _PRESENT, parts.of("hair", "brows") > _HAIR))
+    lines = []
+    if eyes.shape[1] >= _FEW_WHITES:
+        light = eyes.mean(0)
+        _, green, blue = eyes[:, light >= light.quantile(_WHITES)].median(1).values.clamp(min=0.02).tolist()
+        if math.log(blue / green) > _VIOLET_WHITES:
+            lines.append(
+                f"whites of eyes that are violet or blue (blue {blue / green:.2f} of green): a filter, such light?"
+            )
+    if hair.shape[1] >= _FEW_HAIRS:
+        light = hair.mean(0)
+        red, green, _ = hair[:, light <= light.quantile(_DARK_HAIR)].mean(1).clamp(min=0.02).tolist()
+        if math.log(red / green) < _TEAL_HAIR:
+            lines.append(f"dark hair that is greenish (red {red / green:.2f} of green): a filter, such light, a dye?")
     return lines
 
 
