@@ -11,8 +11,10 @@ from planted.characters import Planted, packed, unpacked, write_character
 from torchface import Take, Track, save_take
 from torchface.errors import FileFormatError
 from torchface.geometry.cameras.calibration import CameraCalibration
-from torchface.io import save_calibration, save_mesh
+from torchface.io import save_calibration, save_mesh, save_rig
 from torchface.io.landmarks.landmark_points import save_pts
+from torchface.mesh import Mesh
+from torchface.rig import BlendshapeRig
 from torchface.synthetic import neutral_head
 from torchface.workflows.describe_file import describe
 
@@ -110,3 +112,15 @@ def test_a_path_as_a_shell_would_have_read_it_is_suggested(tmp_path: Path, typed
     assert str(refused.value).endswith(f"; did you mean {shlex.quote(str(there))}?")
     with pytest.raises(FileFormatError, match=r"expected an existing one$"):
         describe(Path(f"'{there}x'"))
+
+
+def test_triangles_without_area_are_counted_where_a_rig_is_described(tmp_path: Path) -> None:
+    vertices = torch.tensor([[0.0, 0, 0], [100, 0, 0], [0, 100, 0], [100, 100, 0], [50, 100, 0]])
+    faces = torch.tensor([[0, 1, 2], [1, 3, 2], [2, 3, 4]])
+    folded = torch.zeros(5, 3)
+    folded[0] = torch.tensor([50.0, 50.0, 0.0])
+    rig = BlendshapeRig(Mesh(vertices, faces), torch.stack([folded, 0.5 * folded]), ["folded", "half"])
+    save_rig(rig, tmp_path / "rig.glb")
+    assert dict(describe(tmp_path / "rig.glb"))["triangles without area"] == "1 at rest, 1 in folded"
+    save_rig(BlendshapeRig(Mesh(vertices[:4], faces[:2]), rig.deltas[1:, :4], ["half"]), tmp_path / "whole.glb")
+    assert "triangles without area" not in dict(describe(tmp_path / "whole.glb"))

@@ -13,6 +13,7 @@ from torchface.errors import FileFormatError
 from torchface.files.models import DESCRIPTION
 from torchface.files.whole_files import check_there, read_file
 from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.meshes.deformation import degenerate_triangles
 from torchface.io import (
     HeadModelFile,
     load_animation,
@@ -258,6 +259,14 @@ def _rig_rows(rig: BlendshapeRig) -> Rows:
     order = reach.argsort(descending=True)[:_MAX_NAMED].tolist()
     largest = ", ".join(f"{rig.names[row]} {float(reach[row]):.1f}" for row in order)
     rows = [*_mesh_rows(rig.neutral), ("shapes", _named(rig.names)), ("largest motions, mm", largest)]
+    flat = degenerate_triangles(rig.vertices, rig.neutral.faces)
+    lost = {
+        name: int((degenerate_triangles(rig.vertices + delta, rig.neutral.faces) & ~flat).sum())
+        for name, delta in zip(rig.names, rig.deltas, strict=True)
+    }
+    counts = {"at rest": int(flat.sum()), **{f"in {name}": count for name, count in lost.items()}}
+    if said := [f"{count} {where}" for where, count in counts.items() if count]:
+        rows.append(("triangles without area", ", ".join(said[:_MAX_NAMED])))
     moving = {name: bool((reach[list(shape.rows)] > 0).any()) for name, shape in recognised_shapes(rig.names).items()}
     if moving:
         still = [name for name, moves in moving.items() if not moves]

@@ -1,5 +1,6 @@
 """Deformation transfer on small rigs whose answers are known, and on a real head."""
 
+import warnings
 from pathlib import Path
 
 import pytest
@@ -216,12 +217,13 @@ def test_triangles_without_area_are_survived_and_reported() -> None:
     assert 300 in report.flat_source
     assert 150 in report.flat_shapes["bulge"]
     assert len(report.flat_target) == 0
-    with pytest.warns(UserWarning, match="without area.*bulge"):
+    with warnings.catch_warnings():  # what the template has is said by `torchface info`, not at each use
+        warnings.simplefilter("error")
         result = transfer_deformation(broken, broken.neutral)
     assert farthest(result.deltas, deltas) < 1e-3
     flat_target = other_face(rig).vertices.clone()
     flat_target[c] = 0.5 * (flat_target[a] + flat_target[b])
-    with pytest.warns(UserWarning, match="target"):
+    with pytest.warns(UserWarning, match="without area in the target: 1$"):
         result = transfer_deformation(rig, rig.neutral.with_vertices(flat_target))
     assert float(result.deltas.norm(dim=-1).max()) < 2 * float(rig.deltas.norm(dim=-1).max())
 
@@ -256,8 +258,7 @@ def real_rig(ict_folder: Path) -> BlendshapeRig:
 @pytest.mark.bench
 @pytest.mark.real
 def test_a_real_head_onto_itself_and_onto_a_turned_copy(real_rig: BlendshapeRig) -> None:
-    with pytest.warns(UserWarning, match="2 in mouthStretch_R"):
-        itself = transfer_deformation(real_rig, real_rig.neutral)
+    itself = transfer_deformation(real_rig, real_rig.neutral)
     assert farthest(itself.deltas, real_rig.deltas) < 1e-3
     turn = rotation().float()
     turned = real_rig.neutral.with_vertices(1.3 * real_rig.vertices @ turn.T + 100)

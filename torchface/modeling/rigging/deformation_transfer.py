@@ -50,14 +50,12 @@ class TransferReport:
     undoes: dict[str, str]
 
     def summary(self) -> str:
-        """One line on triangles without area; empty where there are none."""
-        lines = [
-            f"{len(ids)} in the {what}"
-            for what, ids in (("source's neutral", self.flat_source), ("target", self.flat_target))
-            if len(ids)
-        ]
-        lines += [f"{len(ids)} in {name}" for name, ids in self.flat_shapes.items()]
-        return f"triangles without area: {', '.join(lines)}" if lines else ""
+        """One line on triangles that have no area in the target but in the source; empty where there are none.
+
+        Those of the source are its own at each transfer: ``torchface info`` says them.
+        """
+        lost = len(set(self.flat_target.tolist()) - set(self.flat_source.tolist()))
+        return f"triangles without area in the target: {lost}" if lost else ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +95,7 @@ def transfer_deformation(
 
     Returns:
         A rig of ``target`` with the source's names; solved in float64 on the CPU. Triangles without area are
-        survived with a warning; ``transfer_with_report`` gives the details.
+        survived, with a warning where only the target's have none; ``transfer_with_report`` gives the details.
 
     Raises:
         TopologyError: source and target have other triangles, or none.
