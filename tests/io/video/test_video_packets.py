@@ -38,6 +38,31 @@ def read_whole(path: Path) -> None:
         assert chunk.dtype == torch.uint8
 
 
+@pytest.mark.parametrize("ending", ["mkv", "webm"])
+@pytest.mark.parametrize("start", [0, 90])
+def test_sound_that_goes_on_and_a_late_start_are_no_frames(ending: str, start: int, tmp_path: Path) -> None:
+    """Matroska has the length of the film alone: with its sound, and with what lies before its first frame."""
+    path = tmp_path / f"film.{ending}"
+    with av.open(str(path), "w") as container:
+        video = container.add_stream("libvpx", rate=30)
+        sound = container.add_stream("libopus", rate=48_000)
+        video.width, video.height, video.pix_fmt = 160, 120, "yuv420p"
+        for number in range(20):
+            frame = av.VideoFrame.from_ndarray(pattern(number), "rgb24")
+            frame.pts = start + number
+            container.mux(video.encode(frame))
+        container.mux(video.encode(None))
+        for number in range(150):
+            silence = av.AudioFrame.from_ndarray(np.zeros((1, 960), np.int16), layout="mono")
+            silence.sample_rate, silence.pts = 48_000, 960 * number
+            container.mux(sound.encode(silence))
+        container.mux(sound.encode(None))
+    film = open_video(path)
+    assert film.count == 20
+    assert sum(1 for _ in film.frames()) == 20
+    assert film.uneven_seconds() == (None, "")
+
+
 @pytest.mark.parametrize(("codec", "ending"), FORMATS)
 def test_every_frame_comes_in_order_and_as_opencv_decodes_it(codec: str, ending: str, tmp_path: Path) -> None:
     video = open_video(encode(tmp_path / f"a.{ending}", codec, pixels=PIXELS.get(codec, "yuv420p")))

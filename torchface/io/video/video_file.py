@@ -220,7 +220,9 @@ def open_video(path: str | Path) -> VideoFile:
                 f"{path}: no frame can be decoded{''.join(errors[:1])}; expected a video of a codec that FFmpeg knows"
             )
         aspect, fields = float(stream.sample_aspect_ratio or 1), is_interlaced(stream)
-        declared = stream.frames or round((container.duration or 0) / pyav().time_base * fps)
+        # Some containers have the length of the film alone, with its sound and what lies before its first frame.
+        missing = (container.duration or 0) / pyav().time_base - packets.end
+        declared = stream.frames or len(packets.seconds) + packets.hidden + round(max(missing, 0.0) * fps)
     whole = len(packets.seconds) + packets.hidden >= 0.99 * declared - 1
     count = len(packets.seconds) if whole else declared - packets.hidden
     if not 1 <= count <= _MAX_FRAMES:

@@ -31,16 +31,17 @@ class Packets:
     # When the frame of each is shown, (P,) float64, rising; NaN where the file does not say, at the end.
     seconds: np.ndarray
     hidden: int  # how many more there are that an edit list leaves out
+    end: float  # when the last packet of any stream ends, sound too, seconds; 0 where none says
 
 
-def packets_of(container: InputContainer, stream: VideoStream, errors: list[str]) -> Iterator[Packet | None]:
-    """A stream's packets up to the first that cannot be read, then None, which flushes a decoder.
+def packets_of(container: InputContainer, stream: VideoStream | None, errors: list[str]) -> Iterator[Packet | None]:
+    """A stream's packets, or all streams', up to the first that cannot be read, then None, which flushes a decoder.
 
     What is wrong with that one goes to ``errors``. Empty packets, which stand for a repeated frame, are left out: a
     decoder would take one for the end.
     """
     try:
-        for packet in container.demux(stream):
+        for packet in container.demux(() if stream is None else stream):
             if packet.size:
                 yield packet
     except (pyav().FFmpegError, ValueError) as error:
@@ -50,17 +51,21 @@ def packets_of(container: InputContainer, stream: VideoStream, errors: list[str]
 
 def read_packets(path: Path) -> Packets:
     """Reads packets without decoding them, up to the first that cannot be read."""
-    seconds, hidden = array("d"), 0
+    seconds, hidden, end = array("d"), 0, 0.0
     with open_container(path) as (container, stream):
-        for packet in packets_of(container, stream, []):
+        for packet in packets_of(container, None, []):
             if packet is None:
+                continue
+            time = packet.dts if packet.pts is None else packet.pts
+            if time is not None:
+                end = max(end, float((time + (packet.duration or 0)) * packet.time_base))
+            if packet.stream_index != stream.index:
                 continue
             if packet.is_discard:
                 hidden += 1
                 continue
-            time = packet.dts if packet.pts is None else packet.pts
             seconds.append(np.nan if time is None else float(time * packet.time_base))
-    return Packets(np.sort(np.frombuffer(seconds, np.float64)), hidden)
+    return Packets(np.sort(np.frombuffer(seconds, np.float64)), hidden, end)
 
 
 def key_frame_sizes(path: Path) -> Iterator[tuple[float, int, int]]:
