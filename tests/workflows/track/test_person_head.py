@@ -1,5 +1,6 @@
 """Without a rig the head of whoever is seen is solved with the take, and the weights on it."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -76,6 +77,10 @@ def test_the_head_is_solved_with_the_take(actor: BlendshapeRig, take: tuple[Path
     )
     assert ours < theirs
     assert "head" not in strangers.products
+    # Another take goes on with both files.
+    known = replace(settings, offsets=tmp_path / "out" / "landmark_offsets.json")
+    other = track_video(None, tmp_path / "out" / "head.glb", tmp_path / "other", known)
+    assert torch.equal(other.offsets.millimetres, tracked.offsets.millimetres)
 
 
 def test_a_rig_of_another_topology_is_refused(

@@ -35,6 +35,7 @@ from torchface.workflows.track.take_measurements import (
 )
 from torchface.workflows.track.take_solution import (
     MOTION,
+    OFFSETS,
     frame_times,
     judged_reading,
     keep_solution,
@@ -42,6 +43,7 @@ from torchface.workflows.track.take_solution import (
     known_offsets,
     new_offsets,
     new_solution,
+    rig_digest,
     seen_eyes,
     smoothed_landmarks,
     solution_key,
@@ -49,9 +51,10 @@ from torchface.workflows.track.take_solution import (
     with_eyes,
 )
 from torchface.workflows.track.track_files import OVERLAY, SUMMARY, summary, write_curves
-from torchface.workflows.track.track_inputs import METHOD, TrackInputs, TrackSettings, load_inputs
+from torchface.workflows.track.track_inputs import METHOD, TrackInputs, TrackSettings, load_actor, load_inputs
 from torchface.workflows.track.track_result import Tracked
 from torchface.workflows.track.track_state import TrackState
+from torchface.workflows.track.upright_rig import upright
 
 HEAD = "head.glb"
 
@@ -150,6 +153,8 @@ def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bo
         if head is not None:
             tracked.products["head"] = out / HEAD
             save_rig(tracked.shown, out / HEAD, head.surface)
+    if head is not None and offsets is not None:  # other takes are tracked with the head's file
+        replace(offsets, rig=rig_digest(upright(load_actor(out / HEAD, None))[0])).save(out / OFFSETS)
     if filmed and inputs.settings.overlay != "none":
         _add_overlay(tracked, out, state, key, progress)
     write_json(out / SUMMARY, summary(tracked))
