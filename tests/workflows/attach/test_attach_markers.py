@@ -13,6 +13,7 @@ from torchface.io import save_rig, save_take
 from torchface.synthetic import performer
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.workflows.attach.attach_markers import AttachSettings, attach, cleaned_fit, helmet_markers
+from torchface.workflows.marker_input import MarkerOptions
 
 
 @pytest.fixture(scope="module")
@@ -113,3 +114,28 @@ def test_a_head_that_moves_freely_in_the_volume_moves_no_site(tmp_path: Path) ->
     assert freely.cleanup.masked.sum() == 0
     assert freely.fit.motion.translation.norm(dim=1).max() > 1000
     assert 40 < freely.fit.motion.degrees().norm(dim=1).max() < 90
+
+
+@pytest.mark.parametrize("sided", [True, False])
+def test_a_mirrored_take_is_refused_by_the_sides_of_its_labels_and_else_said_to_look_the_same(
+    tmp_path: Path, sided: bool
+) -> None:
+    rig = performer(texture=False).select(["jawOpen", "mouthPucker", "mouthSmileLeft", "mouthSmileRight"])
+    rows = rig.neutral.landmarks[[17, 21, 22, 26, 31, 35, 48, 54, 51, 57, 50, 52, 41, 46]]
+    names = ["ROB", "RIB", "LIB", "LOB", "nose_r", "nose_l", "mouthRight", "mouthLeft", "UL", "LL", "p", "q", "s", "t"]
+    labels = names if sided else [f"M{number}" for number in range(len(rows))]
+    sites = Attachment.from_vertices(rig.neutral, rows, labels)
+    weights = torch.rand(60, len(rig.names), generator=torch.Generator().manual_seed(0))
+    take = record(rig, sites, weights, torch.Generator().manual_seed(0), StageFlaws(noise=0.1)).take
+    mirrored = take.markers.values * torch.tensor([1.0, 1.0, -1.0])
+    save_rig(rig, tmp_path / "rig.glb")
+    save_take(replace(take, markers=Track(take.markers.names, mirrored)), tmp_path / "rom.c3d")
+    out = tmp_path / "out.json"
+    if sided:
+        with pytest.raises(AlignmentError, match=r"LIB and RIB, .*the coordinates are left-handed \(--flip x\)"):
+            attach(tmp_path / "rig.glb", tmp_path / "rom.c3d", out)
+        flipped = AttachSettings(options=MarkerOptions(flip="x"), insist=True)
+        assert not attach(tmp_path / "rig.glb", tmp_path / "rom.c3d", out, flipped).remarks
+    else:
+        (remark,) = attach(tmp_path / "rig.glb", tmp_path / "rom.c3d", out, AttachSettings(insist=True)).remarks
+        assert "a take in left-handed axes looks the same" in remark

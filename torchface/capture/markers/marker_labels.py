@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from torchface.errors import NameMismatchError
 
 _UNLABELLED = re.compile(r"\*\d*|un(label?led|named|known)[\s_*-]*\d*", re.IGNORECASE)
+_LEFT = re.compile(r"left|Left|LEFT|(?:^|(?<![A-Za-z])|(?<=[a-z]))L|(?:^|(?<![A-Za-z]))l|[Ll]$")
+_RIGHT = {"left": "right", "Left": "Right", "LEFT": "RIGHT", "L": "R", "l": "r"}
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,24 @@ def own_labels(found: Sequence[str], renamed: Mapping[str, str] | None = None) -
     for channel, label in zip(channels, labels, strict=True):
         _assign(assigned, label, channel)
     return LabelMatch(tuple(channels), tuple(labels), tuple(name for name in found if name not in channels))
+
+
+def sided_pairs(labels: Sequence[str]) -> list[tuple[int, int]]:
+    """Rows of labels that say left and right of one place: ``LBRO`` and ``RBRO``, ``brow_l`` and ``brow_r``.
+
+    Example:
+        >>> sided_pairs(["LBRO", "RBRO", "Lip", "cheekLeft", "cheekRight"])
+        [(0, 1), (3, 4)]
+    """
+    row = {label: i for i, label in enumerate(labels)}
+    pairs = []
+    for i, label in enumerate(labels):
+        for side in _LEFT.finditer(label):
+            other = row.get(f"{label[: side.start()]}{_RIGHT[side[0]]}{label[side.end() :]}")
+            if other is not None:
+                pairs.append((i, other))
+                break
+    return pairs
 
 
 def _spelled_out(renamed: Mapping[str, str], found: Sequence[str]) -> dict[str, str]:

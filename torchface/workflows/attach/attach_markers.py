@@ -11,6 +11,7 @@ from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver, align_take, clean_take, fit_attachment
 from torchface.capture.markers import AttachmentFit, Cleanup, check_attachment, sites_by_shape
 from torchface.capture.markers.attachment.attachment_fit import marker_paths
+from torchface.capture.markers.attachment.initial_sites import crossed_sides
 from torchface.capture.markers.cleaning.label_swaps import find_swaps_by_shape, swapped_back
 from torchface.capture.markers.cleaning.take_cleaning import Defect
 from torchface.capture.markers.helmet_motion import free_motion
@@ -48,6 +49,10 @@ _STANDOFF_RATIO = 0.95
 # One marker in so many may sit on the helmet.
 _MAX_HELMET = 3
 _INSIST = "--insist writes the sites all the same"
+_BY_SHAPE = (
+    "found by the markers' shape alone, to which a take in left-handed axes looks the same: see on which side they lie "
+    "(--picture), or say it roughly (--initial)"
+)
 _SETTLED = 1.0  # millimetres: where most markers stay so near to their sites, the pose was found
 
 
@@ -59,6 +64,7 @@ class AttachReport:
     moved: Tensor  # how far each marker's site is from the first guess, (M,), millimetres
     cleanup: Cleanup  # what was wrong with the take
     warnings: tuple[str, ...] = ()  # what the user should know before they use the sites
+    remarks: tuple[str, ...] = ()  # what else there is to say
 
     def lines(self) -> list[str]:
         """For people to read."""
@@ -77,7 +83,7 @@ class AttachReport:
             lines.append(f"helmet or head: moved by up to {self.fit.motion.extent()}; solved along")
         if self.cleanup.defects:
             lines.append(f"cleanup: {self.cleanup.summary()}")
-        return [*(f"warning: {warning}" for warning in self.warnings), *lines, *self._uncertain()]
+        return [*(f"warning: {warning}" for warning in self.warnings), *lines, *self.remarks, *self._uncertain()]
 
     def _uncertain(self) -> list[str]:
         """What the take leaves open."""
@@ -227,9 +233,15 @@ def attach(
     if head is not None:
         steady = head.undo(take.markers.values.double()).to(take.markers.values)
         take = replace(take, markers=replace(take.markers, values=steady))
+    remarks: list[str] = []
     if start is None:
         progress("looking for the pose in which the markers lie on the face")
         start = sites_by_shape(loaded, take)
+        crossed = crossed_sides(start, loaded)
+        if crossed and not settings.insist:
+            raise AlignmentError(f"{rom}: {crossed}; {_INSIST}")
+        notes += [crossed] if crossed else []
+        remarks = [_BY_SHAPE] if crossed is None else []
     elif not settings.insist:
         sites = start.on(loaded.neutral.faces, loaded.vertices)
         check_not_mirrored(marker_paths(take, start), sites, str(rom), take.extras.get("flipped"))
@@ -269,7 +281,7 @@ def attach(
         if picture is not None:
             views = [site_views(loaded.neutral, before, after), errors_by_iteration(fit.errors)]
             save_rendered_image(sheet(views, 1), picture)
-    return AttachReport(fit, torch.linalg.vector_norm(after - before, dim=1), cleanup, tuple(notes))
+    return AttachReport(fit, torch.linalg.vector_norm(after - before, dim=1), cleanup, tuple(notes), tuple(remarks))
 
 
 @dataclass(frozen=True)

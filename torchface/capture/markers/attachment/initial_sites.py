@@ -4,7 +4,9 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
+from torchface.capture.markers.marker_labels import listed, sided_pairs
 from torchface.capture.markers.rest_pose import check_not_collinear
+from torchface.capture.markers.rig_fit_check import unit_of_scale
 from torchface.capture.markers.surface_motion import SurfaceMotion
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.meshes.operators import vertex_normals
@@ -16,6 +18,8 @@ from torchface.take import Take
 
 _NEIGHBOURS, _MIN_MARKERS = 9, 12
 _MIN_MOTION = 0.5
+# So many pairs of labels with a side show whether a take is mirrored, if most of them agree.
+_MIN_PAIRS, _MOST_CROSSED = 3, 0.8
 _MIN_SIZE_RATIO, _MAX_SIZE_RATIO = 0.4, 2.0
 
 
@@ -61,10 +65,11 @@ def sites_by_shape(rig: BlendshapeRig, rom: Take) -> Attachment:
     skin = vertices[faces.unique()]
     size = float((points - points.mean(0)).norm(dim=1).mean() / (skin - skin.mean(0)).norm(dim=1).mean())
     if not _MIN_SIZE_RATIO < size < _MAX_SIZE_RATIO:
+        unit = unit_of_scale(1 / size, rom.extras.get("unit"))
+        seems = f"the take seems to be in {unit} (--unit {unit})" if unit else "is the take's unit right?"
         raise AlignmentError(
             f"markers: found them spread {size:.2g} times as far as the skin that moves, expected {_MIN_SIZE_RATIO} to "
-            f"{_MAX_SIZE_RATIO} times: is the take's unit right? Else give initial sites by --initial "
-            "(torchface pick --mode markers)"
+            f"{_MAX_SIZE_RATIO} times: {seems}; else give initial sites by --initial (torchface pick --mode markers)"
         )
     try:
         pose = find_pose(Samples(points, _outward(points)), ScanPoints.of(vertices, faces)).pose
@@ -76,6 +81,25 @@ def sites_by_shape(rig: BlendshapeRig, rom: Take) -> Attachment:
     rows = (motion.skin & moves[motion.faces].all(1)).nonzero()[:, 0]
     on_skin = SurfaceIndex(vertices, motion.faces[rows]).nearest(pose.apply(points)[0])
     return Attachment(rows[on_skin.triangle], on_skin.barycentric.float(), track.names).made_for(rig.neutral)
+
+
+def crossed_sides(sites: Attachment, rig: BlendshapeRig) -> str | None:
+    """What says that sites found by shape are mirrored: labels of the left that lie on the right.
+
+    Empty where they lie on the left; None where too few labels say a side.
+    """
+    labels = sites.labels or ()
+    pairs = sided_pairs(labels)
+    if len(pairs) < _MIN_PAIRS:
+        return None
+    x = sites.on(rig.neutral.faces, rig.vertices)[:, 0].tolist()
+    crossed = [f"{labels[left]} and {labels[right]}" for left, right in pairs if x[left] < x[right]]
+    if len(crossed) <= _MOST_CROSSED * len(pairs):
+        return ""
+    return (
+        f"{listed(crossed)} lie on the other side of the face than they say: the coordinates are left-handed (--flip "
+        "x), or the labels say the viewer's left (--initial says roughly where they sit)"
+    )
 
 
 def _outward(points: Tensor) -> Tensor:
