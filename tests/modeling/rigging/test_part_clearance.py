@@ -159,7 +159,7 @@ def test_a_registration_that_bent_eyeballs_gets_round_ones_behind_the_lids() -> 
     pose = Similarity(torch.tensor([1.1]).double(), turn[None], torch.tensor([[5.0, 900.0, -40.0]]).double())
     seen = torch.ones(len(spoiled), dtype=torch.bool)
     bent = Registration(true.with_vertices(pose.apply(spoiled)[0]), pose, seen.double(), seen, None)
-    found = pose.inverse().apply(with_placed_parts(template.neutral, bent).mesh.vertices)[0]
+    found = pose.inverse().apply(with_placed_parts(template.select([]), bent).mesh.vertices)[0]
     assert float(parts.depth(spoiled).max()) > 1
     assert float(parts.depth(found).max()) <= TOLERANCE
     centres = eyes(template, parts, true)[0]

@@ -14,14 +14,17 @@ from scipy.spatial.transform import Rotation
 from torchface import zoo
 from torchface.cli import main
 from torchface.errors import AlignmentError, FileFormatError, TopologyError, ValueRangeError
-from torchface.geometry.similarity import similarity_transform
+from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io import load_detail_maps, load_rig, save_mesh, save_rig
 from torchface.io.landmarks.picks import Correspondences, save_correspondences
 from torchface.mesh import Mesh
 from torchface.modeling import MorphableModel, transfer_deformation
-from torchface.registration import hidden_parts, in_place_of, with_template_skin
+from torchface.registration import Registration, hidden_parts, in_place_of, with_template_skin
+from torchface.registration.nonrigid.registration_record import RegistrationRecord
 from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
 from torchface.synthetic.head.neutral_head import neutral_head
+from torchface.workflows.rig import actor_rig
 from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
 
 PICKS = torch.arange(26, 600, 41)
@@ -257,6 +260,34 @@ def test_hidden_eyeballs_and_the_mouth_keep_the_templates_skin_and_nothing_else_
     assert float(values[of_hidden].mean()) > 0.9
     assert float(values[~of_hidden].mean()) < 0.02
     assert with_template_skin(black, white, ~everything) is black
+
+
+def test_what_is_drawn_of_a_registration_is_what_the_rig_has(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    template = performer(texture=False).select(["jawOpen"])
+    notes, rest = template.neutral.annotations, template.vertices
+    assert notes is not None
+    balls = notes.regions["eyeball_left"] | notes.regions["eyeball_right"]
+    through = rest + 15.0 * balls[:, None] * torch.tensor([0.0, 0.0, 1.0])  # before the lids
+    pose = Similarity(torch.ones(1).double(), torch.eye(3).double()[None], torch.tensor([[5.0, 900.0, -40.0]]).double())
+    shown = ~balls
+    record = RegistrationRecord("shape", 0.0, (), (), 0.0, 1.0, 0.0)
+    placed = template.neutral.with_vertices(pose.apply(through.double())[0].float())
+    bent = Registration(placed, pose, shown.double(), shown, record)
+    monkeypatch.setattr(actor_rig, "register", lambda *_, **__: bent)
+    monkeypatch.setattr(actor_rig, "with_eye_note", lambda *given: given[2])
+    drawn: list[Mesh] = []
+
+    def sheet(_: Mesh, registration: Registration) -> torch.Tensor:
+        drawn.append(registration.mesh)
+        return torch.zeros(3, 4, 4)
+
+    monkeypatch.setattr(actor_rig, "registration_sheet", sheet)
+    save_rig(template, tmp_path / "template.glb")
+    save_mesh(Mesh(rest, template.neutral.faces[1:]), tmp_path / "scan.obj")
+    made = rig_actor(tmp_path / "scan.obj", tmp_path / "template.glb", tmp_path / "out.glb").rig
+    assert float((made.vertices - rest)[balls].norm(dim=-1).max()) < 2
+    seen = drawn[0].vertices - torch.tensor([5.0, 900.0, -40.0])
+    assert float((seen - made.vertices).norm(dim=-1).max()) < 0.5
 
 
 def test_details_for_a_file_without_a_place_for_them_are_refused_before_any_work(tmp_path: Path) -> None:

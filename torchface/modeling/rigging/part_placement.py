@@ -12,7 +12,7 @@ from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.part_clearance import Clearance
 from torchface.modeling.rigging.penetration import InnerParts, inner_parts
-from torchface.registration import Registration
+from torchface.registration import Registration, hidden_parts, with_template_skin
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 
@@ -91,18 +91,18 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
     return neutral.with_vertices(placed.to(neutral.vertices))
 
 
-def with_placed_parts(template: Mesh, registration: Registration) -> Registration:
-    """A registration whose eyeballs and teeth are where ``place_parts`` has them, and round, in place of bent ones, and
-    whose mouth lies behind the skin."""
-    rig = BlendshapeRig(template, template.vertices.new_zeros(0, len(template.vertices), 3), ())
-    parts = inner_parts(rig)
+def with_placed_parts(rig: BlendshapeRig, registration: Registration) -> Registration:
+    """A registration whose eyeballs and teeth are where ``place_parts`` has them, and round, in place of bent ones,
+    whose mouth lies behind the skin, and whose hidden parts have the template's colours."""
+    template, parts = rig.neutral, inner_parts(rig)
     upright = registration.pose.inverse().apply(registration.mesh.vertices.detach().cpu().double())[0]
     bent = template.with_vertices(upright.to(template.vertices))
     placed = with_mouth_behind_skin(place_parts(rig, bent, parts) if len(parts.vertices) else bent)
-    if placed is bent:
-        return registration
-    vertices = registration.pose.apply(placed.vertices.detach().cpu().double())[0]
-    return replace(registration, mesh=registration.mesh.with_vertices(vertices.to(registration.mesh.vertices)))
+    mesh = registration.mesh
+    if placed is not bent:
+        vertices = registration.pose.apply(placed.vertices.detach().cpu().double())[0]
+        mesh = mesh.with_vertices(vertices.to(mesh.vertices))
+    return replace(registration, mesh=with_template_skin(mesh, template, hidden_parts(template, registration.matched)))
 
 
 def with_mouth_behind_skin(head: Mesh) -> Mesh:

@@ -22,11 +22,12 @@ from torchface.registration.landmark_files import landmark_file, load_scan_landm
 from torchface.registration.model_fit import LinearShape
 from torchface.registration.nonrigid.schedule import Schedule
 from torchface.registration.own_topology import as_it_is
-from torchface.registration.registered_mesh import hidden_parts, in_place_of, with_template_skin
+from torchface.registration.registered_mesh import in_place_of
 from torchface.registration.scan_colors import has_colors, without_colors
 from torchface.registration.scan_registration import NO_COLORS, Registration, register
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import sheet
+from torchface.rig import BlendshapeRig
 from torchface.viz.figures.error_maps import error_colors
 from torchface.viz.figures.face_views import frame_face
 from torchface.viz.figures.landmark_dots import with_dots
@@ -118,10 +119,8 @@ class ScanJob:
         if left_out:
             notes = tuple(note for note in registration.record.notes if note != NO_COLORS)
             registration = replace(registration, record=replace(registration.record, notes=notes))
-        found = with_placed_parts(self.template, registration)
-        hidden = hidden_parts(self.template, found.matched)
-        found = replace(found, mesh=with_template_skin(found.mesh, self.template, hidden))
-        return found, 0 if landmarks is None else len(landmarks[0])
+        shapeless = BlendshapeRig(self.template, torch.zeros(0, len(self.template.vertices), 3), ())
+        return with_placed_parts(shapeless, registration), 0 if landmarks is None else len(landmarks[0])
 
     def _picture(self, registration: Registration) -> Tensor:
         """The face with landmarks (the scan's green, its own red), its lines, its distances to the scan; (3,H,W)."""

@@ -43,9 +43,9 @@ from torchface.modeling import (
 )
 from torchface.modeling.rigging.example_rigging import RiggingSchedule
 from torchface.modeling.rigging.part_clearance import penetration
-from torchface.modeling.rigging.part_placement import with_mouth_behind_skin
+from torchface.modeling.rigging.part_placement import with_mouth_behind_skin, with_placed_parts
 from torchface.progress import Progress, silent
-from torchface.registration import Registration, hidden_parts, in_place_of, register, with_template_skin
+from torchface.registration import Registration, in_place_of, register
 from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
 from torchface.registration.own_topology import as_it_is
 from torchface.registration.scan_colors import without_colors
@@ -159,10 +159,12 @@ def _rig_actor(
             shown,
             lambda weights: job.registered(job.posed(rig, weights), scan, landmarks, 0),
         )
+        # Before it is drawn: teeth and eyes of the other are where they belong.
+        as_shown = BlendshapeRig(job.posed(rig, shown), rig.deltas, rig.names)
+        registration = with_placed_parts(as_shown, registration)
     neutral = _at_rest(rig, shown, _upright(registration, rig.neutral))
-    if bent:  # teeth and eyes of the other are where they belong
+    if bent and bool(shown.any()):
         neutral = with_mouth_behind_skin(place_parts(rig, neutral, parts))
-        neutral = with_template_skin(neutral, rig.neutral, hidden_parts(rig.neutral, registration.matched))
     transferred = transfer_with_report(rig, neutral, progress=progress)
     notes = (*registration.record.notes, *(f"warning: {note}" for note in neutral_notes(rig, neutral)))
     registration = replace(registration, record=replace(registration.record, notes=notes))
