@@ -163,6 +163,24 @@ def test_hair_painted_on_a_head_is_left_out_and_its_face_is_not() -> None:
     torch.testing.assert_close(shown[at < 0.2], lips[at < 0.2])
 
 
+def test_a_fringe_down_to_the_brows_long_hair_and_what_frames_its_charts_are_left_out_and_highlights_stay() -> None:
+    head = neutral_head()
+    places = FacePlaces.of(head)
+    brows = places.place[head.landmarks[17:27], 1]
+    texels = rasterise_uvs(head.uvs, head.uv_faces, 256, 256)
+    back = (places.behind > 0.6) & (places.place[:, 1] > -1.3)
+    hair = (places.place[:, 1] > float(brows.max()) + 0.01) | back
+    light = ((places.place[:, 1] + 0.2).abs() < 0.1) & (places.out < 0.6)
+    at = texels.interpolate(torch.stack([hair, light & ~hair], dim=1).double(), head.faces)
+    plain, dark = torch.tensor([0.55, 0.40, 0.33]), torch.tensor([0.1, 0.07, 0.05])
+    bright = torch.where(at[:, 1:] > 0.5, torch.tensor([0.95, 0.75, 0.65]), plain)
+    painted = torch.where(at[:, :1] > 0.5, dark, bright)
+    bare_head = without_painted_hair(replace(head, colors=None, texture=texels.image(painted)))
+    shown = bare_head.texture.flatten(1)[:, texels.texels].T
+    assert float((shown - bright).abs().max()) < 0.02
+    assert float((bare_head.texture - dark[:, None, None]).norm(dim=0).min()) > 0.5  # between the charts too
+
+
 def test_light_grey_hair_over_fair_skin_and_before_the_ears_is_left_out() -> None:
     head = neutral_head()
     places = FacePlaces.of(head)

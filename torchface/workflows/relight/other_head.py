@@ -28,6 +28,8 @@ from torchface.workflows.track.upright_rig import upright
 # In distances between the eyes' outer corners; of colours' logarithms; rings of vertices; share; vertices; of white.
 _ABOVE_BROWS, _UNLIKE_SKIN, _HAIR_EDGE, _HALF_HAIR, _FEWEST, _DARK = 0.08, 0.5, 3, 0.2, 20, 0.02
 # Logarithms of hue; behind the ears' landmarks; and over the eyes.
+_DOWN, _STRANDS, _FRINGE, _NAPE = 40, 8, -0.06, -1.6  # rings of vertices; over the brows' landmarks and the eyes
+_STRAND = (0.1, 0.25)  # logarithms by which a strand is darker than skin
 _GREYER, _BACK, _TEMPLES = 0.2, (0.35, -0.7), (-0.45, -0.2)
 
 
@@ -58,28 +60,38 @@ def without_painted_hair(mesh: Mesh) -> Mesh:
     parts = part_vertices(mesh)
     up, behind = places.place[:, 1], places.behind
     sides = ((behind > _BACK[0]) & (up > _BACK[1])) | ((behind > _TEMPLES[0]) & (up > _TEMPLES[1]))
-    forehead = ((up > places.brows + _ABOVE_BROWS) | (sides & ~places.brow)) & ~parts
+    brows = places.place[mesh.landmarks.cpu()[17:27]]
+    above = up - brows[(places.place[:, :1] - brows[:, 0]).abs().argmin(1), 1]
+    forehead = ((above > _ABOVE_BROWS) | (sides & ~places.brow)) & ~parts
     cheeks = places.cheeks & ~parts
     if not cheeks.any():
         return mesh  # nothing says what skin looks like
     skin = colors[cheeks].median(0).values
     apart = colors.log() - skin.log()
     grey = (apart - apart.mean(1, keepdim=True)).norm(dim=1) > _GREYER  # beside fair skin grey hair is hardly darker
-    unlike = (apart.norm(dim=1) > _UNLIKE_SKIN) | grey
+    unlike = (apart.clamp(max=0).norm(dim=1) > _UNLIKE_SKIN) | grey  # what is brighter is a highlight
     graph = VertexGraph(faces, len(colors))
-    hair = (forehead & unlike).double()
+    hair, lower = (forehead & unlike).double(), ((above > _FRINGE) | ((behind > _BACK[0]) & (up > _NAPE))) & ~parts
+    for _ in range(_DOWN):  # nearer to the brows and on the neck only what hangs down from above is hair
+        hair = torch.maximum(hair, (graph.sum(hair[:, None])[:, 0] > 0) * unlike * lower.double())
+    beside = hair
     for _ in range(_HAIR_EDGE):
         hair = torch.maximum(hair, graph.sum(hair[:, None])[:, 0] / graph.degree)
-    hair = (hair / _HALF_HAIR).clamp(max=1) * forehead
+    for _ in range(_STRANDS):
+        beside = torch.maximum(beside, (graph.sum(beside[:, None])[:, 0] > 0) * (forehead | lower).double())
+    hair = (hair / _HALF_HAIR).clamp(max=1) * (forehead | (lower & unlike))
     bare_forehead = forehead & (hair == 0) & (places.out < 1)
     if int(bare_forehead.sum()) >= _FEWEST:
         skin = colors[bare_forehead].median(0).values
     height, width = mesh.texture.shape[1:]
     texels = rasterise_uvs(mesh.uvs.cpu(), mesh.uv_faces.cpu(), height, width)
-    share = texels.interpolate(hair[:, None], faces).T.float()
-    texture = mesh.texture.float().flatten(1).clone()
-    texture[:, texels.texels] = torch.lerp(texture[:, texels.texels], skin[:, None].float(), share)
-    return replace(mesh, texture=texture.view(-1, height, width))
+    shown = mesh.texture.float().flatten(1)[:, texels.texels].T.double()
+    share, near = texels.interpolate(torch.stack([hair, beside], dim=1), faces).double().T[:, :, None]
+    # Single strands lie between vertices.
+    darker = (skin.log() - shown.clamp(min=_DARK).log()).mean(1, keepdim=True)
+    strand = ((darker - _STRAND[0]) / (_STRAND[1] - _STRAND[0])).clamp(0, 1)
+    painted = torch.lerp(shown, skin.expand_as(shown), torch.maximum(share, near * strand))
+    return replace(mesh, texture=texels.image(painted))
 
 
 def as_paint(mesh: Mesh) -> FacePaint:
