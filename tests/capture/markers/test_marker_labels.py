@@ -39,6 +39,14 @@ def test_a_map_goes_first_and_leaves_out() -> None:
     assert match.unmatched == ("M001", "Actor:M002")
 
 
+def test_a_map_may_leave_a_subjects_prefix_out() -> None:
+    found = ("Jane:M001", "Jane:LSHO", "Jane:brow", "Tom:brow")
+    assert match_labels(found, KNOWN, {"LSHO": "M002"}).labels == ("M001", "M002")
+    assert own_labels(found, {"LSHO": ""}).channels == ("Jane:M001", "Jane:brow", "Tom:brow")
+    with pytest.raises(NameMismatchError, match="found brow in the map, expected labels of the take"):
+        own_labels(found, {"brow": ""})
+
+
 def test_a_map_leaves_out_a_whole_subject() -> None:
     found = ["Jane:M001", "Joe:M001", "Jane:M002", "Joe:M002"]
     assert match_labels(found, KNOWN, {"Jane:*": ""}).channels == ("Joe:M001", "Joe:M002")

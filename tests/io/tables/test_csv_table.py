@@ -76,3 +76,18 @@ def test_rows_are_counted_with_excels_line(tmp_path: Path) -> None:
     (tmp_path / "take.csv").write_text("sep=;\nframe;jawOpen\n0;shut\n")
     with pytest.raises(FileFormatError, match="row 3, column 'jawOpen': found 'shut'"):
         TableReader(tmp_path / "take.csv").read()
+
+
+@pytest.mark.parametrize(
+    ("first", "program"),
+    [
+        ("Format Version,1.23,Take Name,a,Capture Frame Rate,120.0,Export Frame Rate,120.0", "Motive"),
+        ("Trajectories", "Vicon"),
+    ],
+)
+def test_tables_with_several_rows_of_headers_are_refused_with_the_formats_that_are_read(
+    tmp_path: Path, first: str, program: str
+) -> None:
+    (tmp_path / "take.csv").write_text(f"{first}\n\n,,a,a,a\n")
+    with pytest.raises(FileFormatError, match=f"{program}'s table with several rows of headers, .* C3D or TRC"):
+        load_take(tmp_path / "take.csv")

@@ -1,6 +1,7 @@
 """Matching of a take's labels with an attachment's markers, as recorders write labels."""
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -41,8 +42,8 @@ def match_labels(found: Sequence[str], known: Sequence[str], renamed: Mapping[st
     Args:
         found: the take's.
         known: the attachment's.
-        renamed: the attachment's label by the take's, which goes first; an empty one leaves the marker out, and
-            ``Actor:*`` with an empty one a whole subject.
+        renamed: the attachment's label by the take's, with its subject or without, which goes first; an empty one
+            leaves the marker out, and ``Actor:*`` with an empty one a whole subject.
 
     Raises:
         NameMismatchError: two labels mean one marker, none means any, or ``renamed`` names a label that is not there.
@@ -139,9 +140,15 @@ def sided_pairs(labels: Sequence[str]) -> list[tuple[int, int]]:
 
 
 def _spelled_out(renamed: Mapping[str, str], found: Sequence[str]) -> dict[str, str]:
-    """A map with ``Actor:*`` as the labels of that subject, which it leaves out."""
-    plain = {name: label for name, label in renamed.items() if label or not name.endswith(":*")}
-    for pattern in renamed.keys() - plain.keys():
+    """A map with ``Actor:*`` as the labels of that subject, which it leaves out, and labels with their subject where
+    it names none."""
+    count = Counter(map(_bare, found))
+    whole = {_bare(name): name for name in found if count[_bare(name)] == 1}
+    subjects = [name for name, label in renamed.items() if not label and name.endswith(":*")]
+    plain = {
+        name if name in found else whole.get(name, name): renamed[name] for name in renamed if name not in subjects
+    }
+    for pattern in subjects:
         plain |= {name: "" for name in found if name.startswith(pattern[:-1]) and name not in plain}
     return plain
 

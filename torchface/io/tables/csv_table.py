@@ -17,6 +17,7 @@ import numpy as np
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.files.whole_files import read_file, replaced_file
 
+_SEVERAL_HEADERS = {"format version": "OptiTrack Motive's", "trajectories": "Vicon's"}  # by their first cell
 MAX_TABLE_BYTES = 2**29  # bytes of text; two hours of 60 fps Live Link Face stay below
 
 _MAX_ROW = 2**22
@@ -102,6 +103,12 @@ class TableReader:
         self.header = tuple(header)
         if not any(self.header):
             raise FileFormatError(f"{path}: found no header, expected the names of the columns in the first row")
+        program = _SEVERAL_HEADERS.get(self.header[0].lower())
+        if program is not None:
+            raise FileFormatError(
+                f"{path}: found {program} table with several rows of headers, expected one: export markers as C3D or "
+                "TRC"
+            )
         twice = [name for name, count in Counter(self.header).items() if count > 1]
         if twice:
             raise FileFormatError(f"{path}: found more than one column {quoted(twice)}, expected each once")

@@ -290,7 +290,8 @@ def check_sites(
         named = listed([f"{labels[i]} ({float(error[i]):.0f} mm)" for i in worst])
         raise AlignmentError(
             f"markers: {named} stay far from the skin while most stay within {typical:.2g} mm: they sit on the "
-            "helmet, fell off, or carry another marker's label; leave them out of the take or correct their label"
+            "helmet or the body, fell off, or carry another marker's label; correct their label, or leave them out by "
+            "a row 'label,' for each in a table (--labels map.csv)"
         )
     if uncertainty.mostly_uncertain:
         sites, shapes = uncertainty.markers, uncertainty.shapes
