@@ -12,7 +12,7 @@ import torch
 import tyro
 
 from torchface import zoo
-from torchface.cli.command_options import inputs_kept, plain_options
+from torchface.cli.command_options import inputs_kept, one_line_each, plain_options
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import plain_errors, print_lines
 from torchface.errors import TorchfaceError, ValueRangeError
@@ -149,7 +149,7 @@ class Recipe(Generic[Settings, Trained]):
                 default = read_settings(Path(given), self.settings)
                 del flags[place : place + (1 if "=" in word else 2)]
                 break
-        text = ((self.description or "") + _CONFIG).replace("``", "`")
+        text = one_line_each(((self.description or "") + _CONFIG).replace("``", "`"))
         name = f"torchface train {recipe_name(self.settings)}"
         try:
             if default is None:

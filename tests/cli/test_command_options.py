@@ -8,6 +8,7 @@ import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from inspect import Parameter, getdoc, signature
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
@@ -162,6 +163,23 @@ def test_the_help_names_what_a_command_takes_and_no_empty_default(
     assert "--no-no" not in printed
     assert command != "register" or "TEMPLATE SCAN..." in printed
     assert command != "render" or "(default: 0)" in printed  # of --frame
+
+
+@pytest.mark.parametrize("width", [80, 120])
+@pytest.mark.parametrize("words", [*ALL, ("train", "morphable"), ("zoo",)])
+def test_help_fills_the_lines_of_a_terminal(
+    words: tuple[str, ...], width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    with pytest.raises(SystemExit):
+        main([*words, "--help"])
+    lines = [line.rstrip() for line in capsys.readouterr().out.splitlines()]
+    assert max(map(len, lines)) <= width
+    below = re.compile(r" {6,}\S")  # goes on from the line above
+    for line, following in pairwise(lines):
+        if below.match(line) and below.match(following):
+            word = following.split()[0]
+            assert len(line) + 1 + len(word) > width - 2, (line, following)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,7 @@
 
 import re
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import tyro
@@ -14,7 +14,7 @@ from torchface.cli.annotate import annotate
 from torchface.cli.arkit import arkit
 from torchface.cli.attach import attach
 from torchface.cli.calibrate import calibrate
-from torchface.cli.command_options import checked, usage_hints
+from torchface.cli.command_options import checked, usage_hints, wrapped_help
 from torchface.cli.convert import convert
 from torchface.cli.corrective import corrective
 from torchface.cli.demo import demo
@@ -99,36 +99,47 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     if arguments is None:
         count_interrupts_once()
-    with plain_errors():
+    with plain_errors(), wrapped_help(words):
         if words in (["--version"], ["-V"]):
             print(f"torchface {__version__}")
             raise SystemExit(0)
         if not words or words in (["--help"], ["-h"]):
-            _overview()
+            _overview("torchface", DESCRIPTION, _summaries())
             raise SystemExit(0 if words else 2)
         _check_command(words[0])
         if words[:1] == ["export"] and words[1:] and words[1] not in EXPORTS and not words[1].startswith("-"):
-            tyro.cli(checked(export_model), prog="torchface export", args=words[1:])
+            _run(export_model, "torchface export", words[1:])
         elif words[0] == "train":
             train(words[1:])
         elif words[0] in COMMANDS:  # alone: what tyro says of a wrong value then names its help
-            try:
-                tyro.cli(checked(COMMANDS[words[0]]), prog=f"torchface {words[0]}", args=words[1:])
-            except SystemExit as end:
-                if end.code:
-                    print_lines(usage_hints(COMMANDS[words[0]], words[1:]))
-                raise
+            _run(COMMANDS[words[0]], f"torchface {words[0]}", words[1:])
         elif words[0] in GROUPS:
-            group = GROUPS[words[0]]
-            tyro.extras.subcommand_cli_from_dict(
-                {name: checked(command) for name, command in group.commands.items()},
-                prog=f"torchface {words[0]}",
-                description=group.description,
-                args=words[1:],
-            )
+            group, name = GROUPS[words[0]], f"torchface {words[0]}"
+            if words[1:] in ([], ["--help"], ["-h"]):
+                _overview(name, group.description, {one: run.__doc__ or "" for one, run in group.commands.items()})
+                raise SystemExit(0 if words[1:] else 2)
+            if words[1] in group.commands:
+                _run(group.commands[words[1]], f"{name} {words[1]}", words[2:])
+            else:
+                _run_one_of(group.commands, name, words[1:])
         else:
-            commands = {name: checked(command) for name, command in COMMANDS.items()}
-            tyro.extras.subcommand_cli_from_dict(commands, prog="torchface", description=DESCRIPTION, args=words)
+            _run_one_of(COMMANDS, "torchface", words)
+
+
+def _run(command: Callable[..., None], name: str, words: Sequence[str]) -> None:
+    """Runs a command, and says of options that were refused what tyro does not."""
+    try:
+        tyro.cli(checked(command), prog=name, args=words)
+    except SystemExit as end:
+        if end.code:
+            print_lines(usage_hints(command, name, words))
+        raise
+
+
+def _run_one_of(commands: Mapping[str, Callable[..., None]], name: str, words: Sequence[str]) -> None:
+    """Runs the command that the words name, somewhere among options, or says which there are."""
+    ready = {one: checked(command) for one, command in commands.items()}
+    tyro.extras.subcommand_cli_from_dict(ready, prog=name, args=words)
 
 
 def _check_command(word: str) -> None:
@@ -142,15 +153,19 @@ def _check_command(word: str) -> None:
         )
 
 
-def _overview() -> None:
-    """A line a command; tyro would print the whole of each."""
+def _summaries() -> dict[str, str]:
+    own = {name: command.__doc__ or "" for name, command in COMMANDS.items()}
+    return own | {name: group.summary for name, group in GROUPS.items()} | {"train": train.__doc__ or ""}
+
+
+def _overview(name: str, description: str, commands: Mapping[str, str]) -> None:
+    """A line a command, the beginning of its text; tyro would print the whole of each."""
     table = Table(box=None, show_header=False, padding=(0, 2))
-    summaries = {name: (command.__doc__ or "").partition("\n\n")[0] for name, command in COMMANDS.items()}
-    summaries |= {name: group.summary for name, group in GROUPS.items()} | {"train": train.__doc__ or ""}
-    for name, text in summaries.items():
-        summary = " ".join(text.split())
-        table.add_row(Text(name, "bold"), re.split(r"[:;,.](?:\s|$)", summary)[0])
+    for one, text in commands.items():
+        summary = " ".join(text.partition("\n\n")[0].split())
+        table.add_row(Text(one, "bold"), re.split(r"[:;,.](?:\s|$)", summary)[0])
     page = PlainConsole(stderr=False)
-    page.print(f"torchface: {DESCRIPTION}\n", highlight=False)
+    page.print(f"{name}: {description}\n", highlight=False)
     page.print(table, highlight=False)
-    page.print("\ntorchface COMMAND --help shows more of each; torchface --version.", highlight=False)
+    version = "; torchface --version" if name == "torchface" else ""
+    page.print(f"\n{name} COMMAND --help shows more of each{version}.", highlight=False)

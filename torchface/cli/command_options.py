@@ -1,16 +1,19 @@
 """Options of commands: their help in plain words, without a default that is none, and texts that are read as values."""
 
 import re
+import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager, redirect_stdout
 from dataclasses import dataclass, is_dataclass
 from functools import wraps
-from inspect import signature
-from itertools import takewhile
+from inspect import cleandoc, signature
+from itertools import chain, takewhile
 from pathlib import Path
 from shlex import join
+from shutil import get_terminal_size
+from textwrap import wrap
 from types import NoneType, UnionType
-from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Annotated, Any, Literal, TextIO, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 from tyro.constructors import PrimitiveConstructorSpec
@@ -109,8 +112,44 @@ def _paths(value: Any) -> Iterator[Path]:
             yield from _paths(part)
 
 
+@contextmanager
+def wrapped_help(words: Sequence[str]) -> Iterator[None]:
+    """Wraps what a help says above its options to the terminal's width, which tyro does not."""
+    if {"-h", "--help"}.isdisjoint(words):
+        yield
+    else:
+        with redirect_stdout(_Wrapping(sys.stdout)):  # type: ignore[type-var]
+            yield
+
+
+class _Wrapping:
+    """A stream that wraps long lines between words; those with escape codes are usage and options."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> int:
+        width, text = get_terminal_size().columns, re.sub(r"\n{3,}", "\n\n", text)
+        lines = (
+            wrap(line, width, break_long_words=False, break_on_hyphens=False)
+            if len(line) > width and "\x1b" not in line
+            else [line]
+            for line in text.split("\n")
+        )
+        return self._stream.write("\n".join(chain.from_iterable(lines)))
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+
+def one_line_each(text: str) -> str:
+    """A docstring whose paragraphs and arguments are a line each: tyro keeps some of a text's line breaks."""
+    return re.sub(r"(?<=\S)\n( {8,})?(?=\S)", " ", cleandoc(text))
+
+
 def plain_options(command: Command) -> Command:
     """The command, or the dataclass, whose help says ``PATH`` instead of ``{None}|PATH (default: None)``."""
+    command.__doc__ = one_line_each(command.__doc__ or "") or None
     hints = get_type_hints(command, include_extras=True)
     for name, parameter in signature(command).parameters.items():
         kind, *notes = get_args(hints[name]) if get_origin(hints[name]) is Annotated else (hints[name],)
@@ -134,7 +173,7 @@ def plain_options(command: Command) -> Command:
     return command
 
 
-def usage_hints(command: Callable[..., Any], words: Sequence[str]) -> Iterator[str]:
+def usage_hints(command: Callable[..., Any], called: str, words: Sequence[str]) -> Iterator[str]:
     """What tyro does not say of options that it refused: which are given again, and which have a place and no flag."""
     hints = get_type_hints(command, include_extras=True)
     for name, hint in hints.items():
@@ -145,7 +184,7 @@ def usage_hints(command: Callable[..., Any], words: Sequence[str]) -> Iterator[s
             places = [_place(one, among) for one, among in marks.items() if Positional in among]
             given = [word for word in words if not word.startswith("-")]
             right = join(given) if len(given) == len(places) else " ".join(places)  # of more, which is not known
-            yield f"{name.upper()} has a place and no flag: torchface {command.__name__} {right}"
+            yield f"{name.upper()} has a place and no flag: {called} {right}"
         for at, word in enumerate(words):
             values = [*takewhile(lambda value: not value.startswith("-"), words[at + 1 :])]
             if UseAppendAction in notes and word == flag and len(values) > 1:
