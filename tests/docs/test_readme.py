@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from torchface import Attachment, Take, Track, save_rig, save_take
+from torchface.geometry.rotations import rotation_matrix
 from torchface.io import load_animation
 from torchface.synthetic import performer
 
@@ -39,7 +40,10 @@ def test_the_markers_for_a_graph_are_brought_into_the_rigs_space(
     labels, order = list(sites.labels), torch.arange(len(sites.labels)).flip(0)
     save_rig(actor, "actor.glb")
     sites.save("attachment.json")
-    moved = Track([labels[i] for i in order], markers[:, order] @ turn.T + torch.tensor([90.0, -1200.0, 40.0]))
+    phase = torch.linspace(0, 6, len(markers))
+    slip = rotation_matrix(0.05 * torch.stack([phase.sin(), phase.cos(), 0 * phase], 1))
+    slid = markers @ slip.transpose(1, 2) + 4 * torch.stack([phase.sin(), 0 * phase, phase.cos()], 1)[:, None]
+    moved = Track([labels[i] for i in order], slid[:, order] @ turn.T + torch.tensor([90.0, -1200.0, 40.0]))
     save_take(Take(30.0, markers=moved), "take.c3d")
     exec(compile(code, str(page), "exec"), {})
     written = torch.from_numpy(np.load("markers.npy"))

@@ -22,10 +22,10 @@ def solver(
 ) -> None:
     """Write the marker solve of one rig and one marker layout as an ONNX file, and check it.
 
-    Inputs of the graph: `markers` (B,M,3), millimetres in the rig's space, NaN where not seen, and `previous` (B,N),
-    the weights of the frame before (zeros will do). Output: `weights` (B,N). Shape names, marker labels and units are
-    in the file's metadata. ONNX Runtime is compared with PyTorch, and the graph with the exact solve at 0, 10 and 30 %
-    missing markers.
+    Inputs of the graph: `markers` (B,M,3), millimetres in the rig's space without the motion of helmet or head, NaN
+    where not seen, and `previous` (B,N), the weights of the frame before (zeros will do). Output: `weights` (B,N).
+    Shape names, marker labels and units are in the file's metadata. ONNX Runtime is compared with PyTorch, and the
+    graph with the exact solve at 0, 10 and 30 % missing markers.
 
     Args:
         rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
