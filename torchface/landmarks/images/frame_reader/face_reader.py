@@ -49,6 +49,7 @@ _ANYWHERE = (32.0, 32.0, 64.0, 1.0, 0.0)  # a place, where there is none to look
 _SHRUNK, _GROWN = 0.6, 1.6  # of a face from one picture to the next
 _LONG = 1e3  # seconds
 _DOUBT = 0.25  # seconds of presence below ``sure`` and the like after which the box network is asked, again and again
+_EMPTY = 0.1  # mean visibility of the landmarks where nothing of a face is left: the box network is asked at once
 _PATIENCE = 0.3  # seconds for which a lost face is waited for at its place before another of several is taken
 # Seconds after which the box network is asked who else is about: usually, and where a landmark is less visible than the
 # third. Where somebody is near it is asked in every picture: else the other is taken for the followed one at times. And
@@ -118,10 +119,11 @@ class FaceReader(nn.Module):
         crowded = is_beside(people)
         hidden = crowded & is_awaited(people)
         waiting = hidden | (~crowded & (missing < _PATIENCE))
-        asked = followed & (doubt >= _DOUBT) & ((since >= _DOUBT) | crowded)
+        doubted = followed & (doubt >= _DOUBT)
         lost_now = ~followed & ((missing <= _EAGER) | (since >= _PAUSE) | hidden)
         pause = torch.where(covered > 0.5, _COVERED, _COUNTED)
-        searched = asked | lost_now | (followed & (crowded | (since >= pause)))
+        searched = (doubted & (since >= _DOUBT)) | lost_now | (followed & (crowded | (since >= pause)))
+        asked = doubted & searched
         # Who is about as large as the face that is followed is seen in a small copy too.
         enough = (size.amax(0) * _ENOUGH / place[2].clamp(min=1)).clamp(max=INPUT_SIZE)
         longest = torch.where(followed, enough, float(INPUT_SIZE))
@@ -170,12 +172,13 @@ class FaceReader(nn.Module):
         kept = kept & (presence >= settings.least) & (growth > _SHRUNK) & (growth < _GROWN)
         good = (followed & kept) | (~followed & ~vague & (presence >= settings.new))
         good = good & ready & ~stranger & plausible(own, size, settings.smallest)
+        empty = looked.visibility.mean() < _EMPTY
         clear = ((presence >= settings.sure) & ~vague) | confirmed
         refused = lost_now & ~followed & there & ~good
         counts = [
             good.float(),
             torch.where(good, 0.0, (missing + interval).clamp(max=_LONG)),
-            torch.where(good & ~clear, doubt + interval, 0.0),
+            torch.where(good & ~clear, torch.where(empty, doubt.clamp(min=_DOUBT), doubt + interval), 0.0),
             torch.where(searched, 0.0, (since + interval).clamp(max=_LONG)),
             torch.where(good, 0.0, attempt + refused),  # kept between searches: else the same is tried each time
             (looked.visibility.amin(0) < _HIDDEN).float(),
