@@ -142,6 +142,18 @@ def test_it_stays_with_the_largest_and_finds_it_again(webcam: Webcam, portrait: 
     assert column(webcam.step(both(small, head))) > 190  # forgotten: the largest
 
 
+@pytest.mark.parametrize(("grey", "frames"), [(60, 3), (110, 3), (0, 12)])
+def test_a_plain_wall_is_no_face_for_long(
+    webcam: Webcam, portrait: tuple[Tensor, Tensor], grey: int, frames: int
+) -> None:
+    """The network does not say surely that a plain wall is no face; it is least sure before a covered lens."""
+    for _ in range(8):
+        assert webcam.step(scene(portrait[0], (60, 50))).presence > 0.9
+    wall = torch.full((3, 240, 400), grey, dtype=torch.uint8)
+    kept = [float(webcam.step(wall).presence) for _ in range(frames)]
+    assert kept[-1] == 0
+
+
 @pytest.mark.parametrize(
     "film",
     [
@@ -155,18 +167,6 @@ def test_it_stays_with_the_largest_and_finds_it_again(webcam: Webcam, portrait: 
     ],
     ids=["beside", "passing", "alike", "slow", "near", "before", "alike before"],
 )
-@pytest.mark.parametrize(("grey", "frames"), [(60, 3), (110, 3), (0, 12)])
-def test_a_plain_wall_is_no_face_for_long(
-    webcam: Webcam, portrait: tuple[Tensor, Tensor], grey: int, frames: int
-) -> None:
-    """The network does not say surely that a plain wall is no face; it is least sure before a covered lens."""
-    for _ in range(8):
-        assert webcam.step(scene(portrait[0], (60, 50))).presence > 0.9
-    wall = torch.full((3, 240, 400), grey, dtype=torch.uint8)
-    kept = [float(webcam.step(wall).presence) for _ in range(frames)]
-    assert kept[-1] == 0
-
-
 def test_it_stays_with_a_person_before_whom_another_passes(reader: FaceReader, film: dict[str, Any]) -> None:
     """Reader and tracker alike: never for two frames with the other, soon with the first again; others are counted."""
     crossing = crossing_film(**film)
