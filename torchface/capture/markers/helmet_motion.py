@@ -1,12 +1,13 @@
 """The rigid motion of a helmet on the head, or of the head in a capture volume."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchface.geometry.rotations import rotation_matrix, rotation_vector
 from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.take import Take
 from torchface.temporal import nearest_rows
 
 # Rotations are scaled to the motion of a point this far from the pivot, in mm, so that all six columns are of one size.
@@ -123,6 +124,16 @@ def free_motion(seen: Tensor) -> HelmetMotion | None:
     found, rows = rough_motion(seen, path[away.argmin()])
     nearest = rows[nearest_rows(rows, len(seen))]
     return HelmetMotion(found.rotation[nearest], found.translation[nearest], found.pivot)
+
+
+def steady_take(take: Take) -> tuple[Take, HelmetMotion | None]:
+    """A take without :func:`free_motion` of its markers, and that motion; as it is where there is none."""
+    assert take.markers is not None
+    values = take.markers.values
+    motion = free_motion(values.double())
+    if motion is None:
+        return take, None
+    return replace(take, markers=replace(take.markers, values=motion.undo(values.double()).to(values))), motion
 
 
 def rigid_columns(rest: Tensor, pivot: Tensor) -> Tensor:

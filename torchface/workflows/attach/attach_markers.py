@@ -14,7 +14,7 @@ from torchface.capture.markers.attachment.attachment_fit import marker_paths
 from torchface.capture.markers.attachment.initial_sites import crossed_sides
 from torchface.capture.markers.cleaning.label_swaps import find_swaps_by_shape, swapped_back
 from torchface.capture.markers.cleaning.take_cleaning import Defect
-from torchface.capture.markers.helmet_motion import free_motion
+from torchface.capture.markers.helmet_motion import steady_take
 from torchface.capture.markers.rest_pose import check_not_mirrored, inlier_markers
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.files.content_keys import content_key
@@ -228,11 +228,7 @@ def attach(
     progress("reading the range of motion")
     start = None if settings.initial is None else load_sites(settings.initial, loaded.neutral, rig)
     take, start, notes = read_range_of_motion(rom, start, settings.options)
-    assert take.markers is not None
-    head = free_motion(take.markers.values.double())
-    if head is not None:
-        steady = head.undo(take.markers.values.double()).to(take.markers.values)
-        take = replace(take, markers=replace(take.markers, values=steady))
+    take, head = steady_take(take)
     remarks: list[str] = []
     if start is None:
         progress("looking for the pose in which the markers lie on the face")

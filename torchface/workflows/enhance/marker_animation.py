@@ -8,6 +8,7 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.capture import align_take
+from torchface.capture.markers.helmet_motion import steady_take
 from torchface.capture.markers.rest_pose import check_not_collinear, check_not_mirrored
 from torchface.enhancement.thin_shell import LEAST_POINTS, ThinShell, rigid_motion
 from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
@@ -134,6 +135,9 @@ def _pose(path: Path, take: Take, sites: MarkerSites, shell: ThinShell, neutral:
     assert take.markers is not None
     if neutral is not None and not 0 <= neutral < len(take):
         raise ValueRangeError(f"--neutral: found frame {neutral}, expected 0 to {len(take) - 1}")
+    # The mean places of a head that moves freely are those of a smaller face.
+    take, _ = steady_take(take)
+    assert take.markers is not None
     if sites.rig is not None and sites.correspondence is not None:
         pose = align_take(sites.rig, sites.attachment, take, neutral)
         onto = sites.correspondence.pose

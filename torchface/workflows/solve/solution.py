@@ -18,7 +18,7 @@ from torchface.capture import (
     rest_residual,
 )
 from torchface.capture.markers import Cleanup, FitCheck, HelmetMotion
-from torchface.capture.markers.helmet_motion import free_motion
+from torchface.capture.markers.helmet_motion import steady_take
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY
 from torchface.evaluation.mesh_errors import marker_offsets
 from torchface.geometry.similarity import Similarity
@@ -197,12 +197,11 @@ def solve_markers(
     whole = predicted is None and not settings.frame_by_frame
     warnings = check_coverage(attachment, take, len(rig.names), settings.insist).warnings()
 
-    assert take.markers is not None
     alignment, head, raw = None, None, take
     if settings.align or settings.neutral is not None:
         progress("aligning the take with the rig")
-        if settings.slip and (head := free_motion(take.markers.values.double())) is not None:
-            raw = _moved(take, head.undo)
+        if settings.slip:
+            raw, head = steady_take(take)
         alignment = align_take(rig, attachment, raw, settings.neutral, settings.insist, settings.free_scale)
         take = _moved(raw, alignment.apply)
     solver = MarkerSolver(rig, attachment, sparsity=settings.sparsity, ridge=settings.ridge)
