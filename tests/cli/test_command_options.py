@@ -17,7 +17,7 @@ import tyro
 from tyro.conf import arg
 
 from torchface.cli import COMMANDS, GROUPS, main
-from torchface.cli.command_options import Output, checked
+from torchface.cli.command_options import Output, checked, placed
 from torchface.cli.export import export_model
 from torchface.io import save_mesh
 from torchface.synthetic import neutral_head
@@ -197,10 +197,7 @@ def test_the_help_shows_one_value_where_an_option_is_given_again_for_each(
     ("words", "hint"),
     [
         ("live 0 --to osc://a:1 vmc://b:2", "again for each: --to osc://a:1 --to vmc://b:2"),
-        ("convert a.obj --out b.glb", "OUT has a place and no flag: torchface convert a.obj b.glb"),
-        ("convert a.obj -o b.glb", "OUT has a place and no flag: torchface convert a.obj b.glb"),
-        ("convert 'my a.obj' -o b.glb", "OUT has a place and no flag: torchface convert 'my a.obj' b.glb"),
-        ("convert a.glb 's l i p.csv' --out b.glb", "OUT has a place and no flag: torchface convert FILE OUT"),
+        ("convert a.obj b.glb --out c.glb", "Unrecognized options: b.glb"),
     ],
 )
 def test_an_option_given_in_the_way_of_another_is_refused_with_the_right_way(
@@ -209,6 +206,35 @@ def test_an_option_given_in_the_way_of_another_is_refused_with_the_right_way(
     with pytest.raises(SystemExit, match="2"):
         main(shlex.split(words))
     assert hint in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(
+    ("words", "right"),
+    [
+        ("convert a.obj --out b.glb", "a.obj b.glb"),
+        ("convert a.obj --at jawOpen=1 -o b.glb", "a.obj b.glb --at jawOpen=1"),
+        ("convert --unit cm a.obj --out=b.glb", "--unit cm a.obj b.glb"),
+        ("export solver --attachment a.json --rig r.glb --out o.onnx", "r.glb --attachment a.json --out o.onnx"),
+        ("export action-units --model units -o o.onnx", "units -o o.onnx"),
+        ("register s.obj t.obj --template r.glb --out o", "r.glb s.obj t.obj --out o"),
+        ("solve r.glb --take a.c3d b.c3d --out o.csv", "r.glb a.c3d b.c3d --out o.csv"),
+        ("solve r.glb a.c3d --out o.csv", "r.glb a.c3d --out o.csv"),
+        ("convert a.obj --out", "a.obj --out"),
+    ],
+)
+def test_what_has_a_place_may_be_given_as_a_flag(words: str, right: str) -> None:
+    one, *rest = words.split()
+    command = COMMANDS[one] if one in COMMANDS else GROUPS[one].commands[rest.pop(0)]
+    assert placed(command, rest) == right.split()
+
+
+def test_every_command_s_output_may_be_given_as_out(tmp_path: Path) -> None:
+    save_mesh(neutral_head(texture=False), tmp_path / "head.obj")
+    main(["convert", str(tmp_path / "head.obj"), "--out", str(tmp_path / "head.ply"), "--quiet"])
+    assert (tmp_path / "head.ply").is_file()
+    for words, command in ALL.items():
+        written = [option.name for option in options_of(command) if option.output is not None]
+        assert "out" in written or words[-1] in ("live", "info", "list", "describe", "verify"), words
 
 
 def test_a_wrong_word_is_refused_with_the_right_ones_in_their_order(capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,7 +14,7 @@ from torchface.cli.annotate import annotate
 from torchface.cli.arkit import arkit
 from torchface.cli.attach import attach
 from torchface.cli.calibrate import calibrate
-from torchface.cli.command_options import checked, usage_hints, wrapped_help
+from torchface.cli.command_options import checked, placed, usage_hints, wrapped_help
 from torchface.cli.convert import convert
 from torchface.cli.corrective import corrective
 from torchface.cli.demo import demo
@@ -129,10 +129,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def _run(command: Callable[..., None], name: str, words: Sequence[str]) -> None:
     """Runs a command, and says of options that were refused what tyro does not."""
     try:
-        tyro.cli(checked(command), prog=name, args=words)
+        tyro.cli(checked(command), prog=name, args=placed(command, words))
     except SystemExit as end:
         if end.code:
-            print_lines(usage_hints(command, name, words))
+            print_lines(usage_hints(command, words))
         raise
 
 

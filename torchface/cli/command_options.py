@@ -9,7 +9,6 @@ from functools import wraps
 from inspect import cleandoc, signature
 from itertools import chain, takewhile
 from pathlib import Path
-from shlex import join
 from shutil import get_terminal_size
 from textwrap import wrap
 from types import NoneType, UnionType
@@ -173,27 +172,36 @@ def plain_options(command: Command) -> Command:
     return command
 
 
-def usage_hints(command: Callable[..., Any], called: str, words: Sequence[str]) -> Iterator[str]:
-    """What tyro does not say of options that it refused: which are given again, and which have a place and no flag."""
-    hints = get_type_hints(command, include_extras=True)
-    for name, hint in hints.items():
-        flag, notes = f"--{name.replace('_', '-')}", getattr(hint, "__metadata__", ())
-        flags = (flag, "-o") if name == "out" else (flag,)
-        if Positional in notes and any(word.split("=")[0] in flags for word in words):
-            marks = {one: getattr(other, "__metadata__", ()) for one, other in hints.items()}
-            places = [_place(one, among) for one, among in marks.items() if Positional in among]
-            given = [word for word in words if not word.startswith("-")]
-            right = join(given) if len(given) == len(places) else " ".join(places)  # of more, which is not known
-            yield f"{name.upper()} has a place and no flag: {called} {right}"
+def placed(command: Callable[..., Any], words: Sequence[str]) -> list[str]:
+    """The words, in which what has a place and was given as a flag, such as ``--out`` of convert, stands there."""
+    words, hints = list(words), get_type_hints(command, include_extras=True)
+    marked = {name: hint for name, hint in hints.items() if Positional in getattr(hint, "__metadata__", ())}
+    for place, (name, hint) in enumerate(marked.items()):
+        flags = (f"--{name.replace('_', '-')}", *(["-o"] if name == "out" else []))
+        at = next((i for i, word in enumerate(words) if word.partition("=")[0] in flags), len(words))
+        _, joined, value = "".join(words[at : at + 1]).partition("=")
+        given = [value] if joined else [*_values(words[at + 1 :])]
+        given = given if _many(get_args(hint)[0]) else given[:1]
+        if given:
+            del words[at : at + (1 if joined else 1 + len(given))]
+            where = place if len([*_values(words)]) >= place else len(words)
+            words[where:where] = given
+    return words
+
+
+def _values(words: Sequence[str]) -> Iterator[str]:
+    """The words before the first flag."""
+    return takewhile(lambda word: not word.startswith("-"), words)
+
+
+def usage_hints(command: Callable[..., Any], words: Sequence[str]) -> Iterator[str]:
+    """What tyro does not say of options that it refused: which are given again."""
+    for name, hint in get_type_hints(command, include_extras=True).items():
+        flag = f"--{name.replace('_', '-')}"
         for at, word in enumerate(words):
-            values = [*takewhile(lambda value: not value.startswith("-"), words[at + 1 :])]
-            if UseAppendAction in notes and word == flag and len(values) > 1:
+            values = [*_values(words[at + 1 :])]
+            if UseAppendAction in getattr(hint, "__metadata__", ()) and word == flag and len(values) > 1:
                 yield f"{flag} takes one value and is given again for each: {' '.join(f'{flag} {v}' for v in values)}"
-
-
-def _place(name: str, notes: Sequence[Any]) -> str:
-    """What the help calls an argument that has a place."""
-    return next((note.metavar for note in notes if getattr(note, "metavar", None)), name.upper())
 
 
 def _choices(kind: Any) -> PrimitiveConstructorSpec[Any] | None:

@@ -29,7 +29,7 @@ def convert(
         source: A rig (.glb, .gltf, USD, .fbx, .blend, a folder of OBJ files, ICT-FaceKit's FaceXModel folder) or a mesh
             (.obj, .ply, .stl, .off).
         out: .glb, .usda, .usdc, .usd, .usdz, .ma (Maya), .fbx, .blend, or a name without an ending for a folder of OBJ
-            files; a mesh without shapes, or in a pose, also as .obj, .ply, .stl, .off.
+            files; a mesh without shapes, or in a pose, also as .obj, .ply, .stl, .off. May be given as --out OUT.
         unit: Unit of FILE (mm, cm, m) where it is not the format's own.
         part: Keep this region only, such as face.
         names: Names of the written shapes. "arkit": ARKit's where the rig's mean the same. All keep theirs if absent.

@@ -27,7 +27,7 @@ def examples(
     brow_lower_right, brow_raise_right, suck, pull_open, pull_left, pull_right, lower_lip_depress, pucker, stretch,
     rotate_left, rotate_right, tilt_left, tilt_right; or ARKit's names), or these 16 in this order. With --camera you
     are asked for one after the other. With --rig a rig's own shapes are seen by a camera. Left is the person's left,
-    in pictures that are not mirrored. Then: torchface export examples --examples OUT --out solver.onnx.
+    in pictures that are not mirrored. Then: torchface export examples OUT --out solver.onnx.
 
     Args:
         pictures: Pictures of one person, or a folder of them.

@@ -4,6 +4,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
+from tyro.conf import Positional, arg
+
 from torchface.cli.command_options import Output, OutputPath, Part
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, console, print_lines, print_path, print_table
@@ -12,7 +14,7 @@ Method = Literal["splitting", "projected-gradient"]
 
 
 def solver(
-    rig: Path,
+    rig: Annotated[Positional[Path], arg(metavar="RIG")],
     attachment: Path,
     out: OutputPath,
     method: Method = "splitting",
@@ -54,7 +56,9 @@ def solver(
     print_path(out)
 
 
-def action_units(model: str, out: OutputPath, quiet: Quiet = False) -> None:
+def action_units(
+    model: Annotated[Positional[str], arg(metavar="MODEL")], out: OutputPath, quiet: Quiet = False
+) -> None:
     """Write an action unit classifier as an ONNX file, and check it.
 
     Inputs of the graph: `regions` (B,R,h,w), painted patterns in [0,1], and `rest` (R,h,w), the same of the face at
@@ -79,7 +83,7 @@ def action_units(model: str, out: OutputPath, quiet: Quiet = False) -> None:
 
 
 def video_solver(
-    rig: Path,
+    rig: Annotated[Positional[Path], arg(metavar="RIG")],
     camera: Path,
     out: OutputPath,
     prior: str | None = None,
@@ -148,7 +152,7 @@ def video_solver(
 
 
 def examples(
-    examples: Path,
+    examples: Annotated[Positional[Path], arg(metavar="EXAMPLES")],
     out: OutputPath,
     solver: Literal["all-at-once", "regional", "model"] = "all-at-once",
     quiet: Quiet = False,
