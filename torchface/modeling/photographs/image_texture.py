@@ -47,7 +47,7 @@ _LID_SHADOW = 0.5  # of the eye's opening
 _TONE, _SEAM = 40, 16  # rounds over the mesh: the skin around, and the band in which what is completed begins
 _EVEN = 0.04, 0.10  # of a skin's brightness: what is added to it against shadows in even light at most, in shadows
 _DARK = 0.02  # of full white
-_SKIN = (0.74, 0.46, 0.41)  # whose hue the light of photographs is judged by where no colour model is: that of `head`
+_SKIN = (0.80, 0.55, 0.48)  # whose hue the light of photographs is judged by where there is no colour model
 # Logarithms by which a place of skin differs from the skin around it, in brightness and hue: strands of hair, and folds
 # in shadow differ more.
 _FOLDS, _PORES, _FRAMED_SKIN = (0.8, 0.12), (0.2, 0.06), (0.06, 0.04)

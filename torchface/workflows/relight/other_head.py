@@ -27,9 +27,9 @@ from torchface.workflows.track.upright_rig import upright
 
 # In distances between the eyes' outer corners; of colours' logarithms; rings of vertices; share; vertices; of white.
 _ABOVE_BROWS, _UNLIKE_SKIN, _HAIR_EDGE, _HALF_HAIR, _FEWEST, _DARK = 0.08, 0.5, 3, 0.2, 20, 0.02
-# Logarithms of hue; behind the ears' landmarks; and over the eyes.
 _DOWN, _STRANDS, _FRINGE, _NAPE = 40, 8, -0.06, -1.6  # rings of vertices; over the brows' landmarks and the eyes
 _STRAND = (0.1, 0.25)  # logarithms by which a strand is darker than skin
+# Logarithms of hue; behind the ears' landmarks; and over the eyes.
 _GREYER, _BACK, _TEMPLES = 0.2, (0.35, -0.7), (-0.45, -0.2)
 
 
