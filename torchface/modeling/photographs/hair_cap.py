@@ -31,9 +31,9 @@ _BEYOND, _MIDDLE = 0.2, 0.35  # share of hair in a picture above the brows, ther
 # Of full white; shares: of hair in wide patches (leaves 0.53, hair at least 0.70), of what is green beside them.
 _GREEN, _PATCHY, _LEAFY = 0.008, 0.62, 0.2
 _COLUMNS, _COLUMN, _FEW = 17, 0.05, 6  # across the forehead, half the width of each, vertices
+_STEP, _REACH = 0.03, 0.15  # over which the slope of the line is taken, and how far the line counts
 # Widths (radians about the crown's axis) and lengths of strands and of locks, the band over which hair grows thin, how
 # uneven its edge is in that, and by how much strands differ in brightness.
-_STEP = 0.03  # over which the slope of the line is taken
 _STRANDS, _LOCKS = (0.02, 0.25), (0.13, 0.4)
 _THIN, _RAGGED, _CONTRAST = 0.26, 0.5, 0.35
 # In distances between the eyes' outer corners: how far from the face's middle hair hangs beside the neck, and how far
@@ -56,8 +56,12 @@ class HairCap:
     def share(self, place: Tensor) -> Tensor:
         """How much hair covers points (Q,) at places (Q,3)."""
         y, behind = place[:, 1], self.places.ears - place[:, 2]
-        line, before, after = (self._line(place[:, 0], behind + step) for step in (0.0, -_STEP, _STEP))
+        line, before, after, front, back = (
+            self._line(place[:, 0], behind + step) for step in (0.0, -_STEP, _STEP, -_REACH, _REACH)
+        )
         beyond = (y - line) / (1 + ((after - before) / (2 * _STEP)).square()).sqrt()
+        # Where the line is steep the nearest of it lies beside, not below.
+        beyond = torch.maximum(beyond, (y - torch.stack([line, front, back]).amax(0)).clamp(max=_REACH))
         # Hair grows thinner toward its edge, in locks of uneven length, until single strands are left on the skin.
         locks = _noise(self._way(place, *_LOCKS)) - 0.5
         thick = beyond / _THIN + _RAGGED * locks + 0.5
