@@ -80,7 +80,7 @@ def test_white_hair_off_the_head_that_the_network_takes_for_skin_is_hair_and_a_f
 
 def test_hair_over_and_behind_the_ears_is_whole_where_its_line_falls_steeply() -> None:
     places = FacePlaces.of(neutral_head(texture=False))
-    behind, up = torch.meshgrid(torch.linspace(0.25, 0.9, 60), torch.linspace(0.4, 0.6, 40), indexing="ij")
+    behind, up = torch.meshgrid(torch.linspace(0.25, 0.9, 60), torch.linspace(0.45, 0.6, 40), indexing="ij")
     at = torch.stack([torch.full_like(up, 0.8), up, places.ears - behind], dim=-1).double().flatten(0, 1)
     share = HairCap(torch.zeros(3), torch.full((17,), 0.6, dtype=torch.float64), places).share(at)
     assert float(share.min()) > 0.9

@@ -31,7 +31,7 @@ _BEYOND, _MIDDLE = 0.2, 0.35  # share of hair in a picture above the brows, ther
 # Of full white; shares: of hair in wide patches (leaves 0.53, hair at least 0.70), of what is green beside them.
 _GREEN, _PATCHY, _LEAFY = 0.008, 0.62, 0.2
 _COLUMNS, _COLUMN, _FEW = 17, 0.05, 6  # across the forehead, half the width of each, vertices
-_STEP, _REACH = 0.03, 0.15  # over which the slope of the line is taken, and how far the line counts
+_STEP, _REACH = 0.03, 0.3  # over which the slope of the line is taken, and how far the line counts
 # Widths (radians about the crown's axis) and lengths of strands and of locks, the band over which hair grows thin, how
 # uneven its edge is in that, and by how much strands differ in brightness.
 _STRANDS, _LOCKS = (0.02, 0.25), (0.13, 0.4)
