@@ -9,11 +9,12 @@ import torch
 from mutation import check_reader
 from rig_samples import quad_sheet, sheet_rig
 
-from torchface.errors import FileFormatError, NameMismatchError, TopologyError
+from torchface.errors import AlignmentError, FileFormatError, NameMismatchError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.normal_maps import DetailMaps, decode_normals
 from torchface.io import load_image, load_rig, save_mesh, save_rig
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
 
 
 def save_folder(rig: BlendshapeRig, folder: Path) -> None:
@@ -67,6 +68,31 @@ def test_shapes_that_do_not_fit_the_neutral_are_named(tmp_path: Path) -> None:
     path.write_text(re.sub(r"^v \S+", "v nan", path.read_text(), count=1, flags=re.MULTILINE))
     with pytest.raises(FileFormatError, match=r"jawOpen.obj: found NaN or infinity in 1 of 30 vertices, first at 0"):
         load_rig(tmp_path / "rig")
+
+
+@pytest.mark.parametrize(
+    ("fault", "error", "said"),
+    [
+        ("unit", ValueRangeError, r"jawOpen\.obj: found an extent of .* beside the neutral of .* in centimetres"),
+        ("aside", AlignmentError, r"jawOpen\.obj: found that \d+% of its vertices lie \(0, 250, 0\) mm beside"),
+        ("order", AlignmentError, r"jawOpen\.obj: found vertices in another order .* a shift of 1 taken back"),
+    ],
+)
+def test_a_shape_that_is_no_shape_of_the_neutral_is_refused(
+    tmp_path: Path, fault: str, error: type[Exception], said: str
+) -> None:
+    actor = performer(texture=False).select(["jawOpen", "mouthSmileLeft"])
+    save_folder(actor, tmp_path)
+    assert load_rig(tmp_path).names == actor.names
+    shape = actor.vertices + actor.deltas[0]
+    spoilt = {
+        "unit": 0.1 * shape,
+        "aside": shape + torch.tensor([0.0, 250.0, 0.0]),
+        "order": torch.cat([shape[:3000], shape[3000:4500].roll(1, 0), shape[4500:]]),
+    }[fault]
+    save_mesh(actor.neutral.with_vertices(spoilt), tmp_path / "jawOpen.obj")
+    with pytest.raises(error, match=said):
+        load_rig(tmp_path)
 
 
 def test_an_empty_folder_and_a_lone_neutral_are_no_rig(tmp_path: Path) -> None:

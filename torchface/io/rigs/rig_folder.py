@@ -5,20 +5,26 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from torchface.errors import FileFormatError, NameMismatchError
+from torchface.errors import AlignmentError, FileFormatError, NameMismatchError
 from torchface.files.documents import read_json, write_json
 from torchface.files.whole_files import all_or_none, check_writable, made_folder, read_file
 from torchface.geometry.meshes.normal_maps import DetailMaps
+from torchface.geometry.meshes.unit_check import check_unit, extent
+from torchface.geometry.meshes.vertex_order import check_vertex_order
 from torchface.io.gltf.corrective_extras import all_targets, read_correctives, rig_of_targets, write_correctives
 from torchface.io.gltf.gltf_document import Document
 from torchface.io.gltf.mesh_extras import read_annotations, write_extras
 from torchface.io.images.image_files import save_normal_map
 from torchface.io.meshes.obj import face_bytes, read_obj, read_obj_vertices, write_obj, write_obj_shapes
+from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 
 NEUTRAL, NOTES = "neutral", "rig.json"
 _MAX_NOTES = 2**26
+_LARGEST = 3.0  # times the neutral's extent; an open mouth adds a sixth
+_ASIDE, _STEADY = 0.25, 0.01  # of the neutral's extent; a head that moves forward goes less far
 
 
 def load_obj_folder(folder: str | Path, unit: str = "mm", neutral: str | None = None) -> BlendshapeRig:
@@ -34,6 +40,8 @@ def load_obj_folder(folder: str | Path, unit: str = "mm", neutral: str | None = 
     Raises:
         FileFormatError: no neutral or several, no shape, or a broken file.
         TopologyError: a shape has other vertices or faces than the neutral.
+        AlignmentError: a shape's vertices stand in another order than the neutral's, or it lies beside it.
+        ValueRangeError: a shape is in another unit than the neutral.
 
     Example:
         >>> from pathlib import Path
@@ -64,9 +72,30 @@ def load_obj_folder(folder: str | Path, unit: str = "mm", neutral: str | None = 
         names = list(dict.fromkeys([*(name for name in listed if name in files), *files]))
         mesh = replace(mesh, annotations=read_annotations(notes, notes.root.get("mesh"), "mesh", len(mesh.vertices)))
     deltas = [read_obj_vertices(files[name], mesh, topology, unit) - mesh.vertices for name in names]
-    if notes is None:
+    if notes is None:  # by others, who exported each by itself
+        for name, delta in zip(names, deltas, strict=True):
+            _check_place(files[name], mesh, delta)
         return BlendshapeRig(mesh, torch.stack(deltas), tuple(names))
     return rig_of_targets(notes, mesh, torch.stack(deltas), names, read_correctives(notes, notes.root, "document"))
+
+
+def _check_place(path: Path, neutral: Mesh, delta: Tensor) -> None:
+    """Refuses a shape in another unit than the neutral, beside it, or with its vertices in another order."""
+    rest, used = neutral.vertices.double(), neutral.faces.unique()
+    shape, across = rest + delta, extent(rest[used])
+    if not across > 0:
+        return
+    check_unit(str(path), shape[used], across, "the neutral", 1 / _LARGEST, _LARGEST)
+    moved = delta[used].double()
+    aside = moved.median(0).values
+    together = float(((moved - aside).norm(dim=-1) < _STEADY * across).double().mean())
+    if float(aside.norm()) > _ASIDE * across and together > 0.5:
+        way = ", ".join(f"{x:.0f}" for x in aside.tolist())
+        raise AlignmentError(
+            f"{path}: found that {together:.0%} of its vertices lie ({way}) mm beside the neutral's, expected the "
+            "shape in the neutral's place; move it there before it is exported"
+        )
+    check_vertex_order(str(path), rest, shape, neutral.faces, "the neutral")
 
 
 def save_obj_folder(rig: BlendshapeRig, folder: str | Path, detail: DetailMaps | None = None) -> None:
