@@ -65,7 +65,8 @@ def annotate(
                 if finder is None:
                     given = given_reading(Path(landmarks), video)
                     return given.landmarks, given.confidence
-                tracked = track_landmarks(video, LandmarkTracker(finder.finder, face=face), progress)
+                tracker = LandmarkTracker(finder.finder, face=face, fps=video.fps)
+                tracked = track_landmarks(video, tracker, progress)
                 return tracked.values, tracked.confidence
 
             progress("reading")

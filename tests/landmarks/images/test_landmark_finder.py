@@ -130,9 +130,34 @@ def test_a_face_that_was_hidden_or_went_is_noticed_and_found_again(face: Tensor)
     stage.frame((500.0, 100.0))  # behind the edge
     gone = torch.full((3, 200, 400), 90, dtype=torch.uint8)
     assert not any(tracker.step(gone).found for _ in range(5))
-    back = [tracker.step(stage.frame((300.0, 100.0))).found for _ in range(10)]
-    assert back[-1]  # elsewhere, within ten frames
+    assert tracker.step(stage.frame((300.0, 100.0))).found  # elsewhere, at once
     assert tracker.step(stage.frame((306.0, 100.0))).found
+
+
+@pytest.mark.parametrize("elsewhere", [(320.0, 100.0), (60.0, 40.0)])
+def test_somebody_else_is_found_at_once_after_a_cut(face: Tensor, elsewhere: tuple[float, float]) -> None:
+    stage = Stage(face, [(200, 120, 90)])
+    tracker = LandmarkTracker(stage.find, detector=stage.detect)
+    for _ in range(3):
+        assert tracker.step(stage.frame((200.0, 100.0))).found
+    stage.colours = [(40, 90, 180)]
+    assert tracker.step(stage.frame(elsewhere)).found
+
+
+@pytest.mark.parametrize("fps", [15.0, 30.0, 60.0])
+def test_who_stood_there_already_is_not_taken_for_one_who_is_hidden_for_a_moment(face: Tensor, fps: float) -> None:
+    stage = Stage(face, [(200, 120, 90), (70, 90, 180)])
+    tracker = LandmarkTracker(stage.find, detector=stage.detect, fps=fps)
+    there, gone, other = (70.0, 100.0), (-300.0, 100.0), (330.0, 100.0)
+    for _ in range(3):
+        assert tracker.step(stage.frame(there, other)).found
+    for _ in range(round(0.3 * fps)):
+        assert not tracker.step(stage.frame(gone, other)).found
+    back = tracker.step(stage.frame(there, other))
+    assert float((back.landmarks - face - torch.tensor(there)).abs().max()) < 1
+    for _ in range(round(1.1 * fps)):
+        found = tracker.step(stage.frame(gone, other))
+    assert float((found.landmarks - face - torch.tensor(other)).abs().max()) < 1
 
 
 def test_a_resumed_tracker_does_as_one_that_went_on(face: Tensor) -> None:

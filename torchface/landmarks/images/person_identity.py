@@ -31,7 +31,7 @@ _COUNTING = 0.2  # of a new count of people that is taken up at once
 _LASTING = 0.6  # seconds for which it is known where the other is
 _ALIKE, _UNLIKE = 0.8, 1.5  # correlation of looks from which a face counts as the same, and what lacks counts in sides
 _STRANGE = 0.4  # correlation under which a face is not that of one who is hidden
-_SAME = 0.9  # from which it is, where that one was, if the other is seen elsewhere
+SAME = 0.9  # from which it is
 _ELSEWHERE = 0.5  # of a smoothed count of others
 _AROUND = 1.0  # sides: what is half hidden by the other, and so looks like nobody, lies within
 _RESEMBLING = 0.5  # what the logarithm of two sides counts in sides
@@ -51,6 +51,11 @@ def face_look(colors: Tensor) -> Tensor:
 def known_look(identity: Tensor) -> Tensor:
     """How the followed face looks, (192,) of unit length; zeros where that is not known."""
     return identity[2 * _MOTION + 2 :]
+
+
+def look_alone(identity: Tensor) -> Tensor:
+    """What is known after a cut: how the followed one looks, and not where anybody is."""
+    return torch.cat([torch.zeros_like(identity[: 2 * _MOTION + 2]), known_look(identity)])
 
 
 def is_beside(identity: Tensor) -> Tensor:
@@ -104,7 +109,7 @@ def is_other(identity: Tensor, place: Tensor, look: Tensor, interval: Tensor) ->
     hidden = own[5] > 1.5 * interval
     nearer = from_other < from_own * torch.where(hidden, _CLEARLY, 1.0)
     nearer = nearer & ((other[5] > 0.5 * interval) | (from_other < _BESIDE))  # else the other is seen beside this face
-    same = (likeness >= _SAME) & (_apart(own, place[:2]) < _BESIDE)
+    same = (likeness >= SAME) & (_apart(own, place[:2]) < _BESIDE)
     elsewhere = counted_beside(identity).sum() > _ELSEWHERE
     nearer = nearer & ~(hidden & same & elsewhere)
     # Who looks otherwise is somebody else, if one is known or was seen where the first one was not; else the first one

@@ -39,8 +39,8 @@ def video_pictures(
     clip = open_video(video)
     clip.check()
     named = load_finder(model, option="landmark model")
-    tracker = LandmarkTracker(named.finder, face=face)
     step = max(-(-clip.count // _READ), 1)
+    tracker = LandmarkTracker(named.finder, face=face, fps=clip.fps / step)
     readings, sharpness, numbers = [], [], []
     for number, frame in enumerate(clip.color_frames()):  # a frame's box is the one before's
         if number % step:

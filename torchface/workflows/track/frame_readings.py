@@ -64,7 +64,7 @@ def _track(
 ) -> int:
     """Readings of all frames into the state; how many faces the first frame shows."""
     clip = inputs.clip
-    tracker = LandmarkTracker(finder, inputs.models.appearance, graph_detector(), inputs.settings.face)
+    tracker = LandmarkTracker(finder, inputs.models.appearance, graph_detector(), inputs.settings.face, clip.fps)
     done, at, faces = state.done, 0, 0
     if done:  # a run that was killed goes on with all that it knew, and so gives the same landmarks
         tracker.resume(state.memory)

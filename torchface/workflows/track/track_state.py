@@ -18,7 +18,7 @@ FOLDER = "state"
 """Where it lies in the folder of results."""
 
 _RECORD = "track.json"
-_METHOD = "tracked frames/8"
+_METHOD = "tracked frames/9"
 _MAX_PIECE_BYTES = 2**28
 _PARTS = fields(FaceReading)
 

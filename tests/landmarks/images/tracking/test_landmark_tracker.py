@@ -170,12 +170,11 @@ def test_after_a_cut_the_face_is_found_elsewhere(trees: LandmarkTrees, film: tup
     frames, truth = film
     here, _ = side_by_side(frames[:2], (1.0, 1.0))
     here[:, :, :, 260:] = 90
-    there, maps = side_by_side(frames[:1].repeat(12, 1, 1, 1), (1.0, 1.0))
+    there, maps = side_by_side(frames[:1].repeat(3, 1, 1, 1), (1.0, 1.0))
     there[:, :, :, :260] = 90
     track = track_landmarks(torch.cat([here, there]), LandmarkTracker(trees))
-    lost = track.values[:, 0, 0].isnan()
-    assert lost.tolist() == [False] * 2 + [True] * 10 + [False] * 2  # it waits at its place for ten frames
-    assert errors(track.values[-1:], mapped(truth[:1], maps[1])).mean() < 0.04
+    assert not track.values[:, 0, 0].isnan().any()  # from the first frame on
+    assert errors(track.values[2:], mapped(truth[:1], maps[1])).mean() < 0.04
 
 
 def test_a_turned_face_is_found_at_once(trees: LandmarkTrees, film: tuple[Tensor, Tensor]) -> None:

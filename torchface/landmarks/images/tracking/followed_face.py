@@ -4,18 +4,23 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d
 
 from torchface.errors import ShapeError
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop
 from torchface.landmarks.images.ibug_68 import turned_box
-from torchface.landmarks.images.person_identity import IDENTITY, LOOK_MARGIN, face_look
+from torchface.landmarks.images.person_identity import IDENTITY, LOOK_MARGIN, face_look, look_alone
 
 _SIZE = 20  # pixels of the crop that a look is read from
 _LOOK = 3 * _SIZE * _SIZE
+_SAMPLES, _PARTS = 96, 16  # rows or columns of a picture that are looked at, and parts a side that are told apart
+# A cut changes a picture so much, 1 less its correlation, and so many times as much as the frame before did: who passes
+# close to the camera takes some frames. What correlates so much is as it was.
+_CUT, _SUDDEN, _UNCHANGED = 0.25, 4.0, 0.9
 _NEAR, _SMALLER, _LARGER = 0.75, 0.6, 1.6  # sides of the box, and factors of its size
 
 LOOK = _LOOK  # numbers of a look
-MEMORY = 5 + 3 + IDENTITY + 4  # numbers that a followed face is packed into
+MEMORY = 5 + 3 + 2 * 3 * _PARTS**2 + IDENTITY + 6  # numbers that a followed face is packed into
 
 
 @dataclass(eq=False)
@@ -26,6 +31,9 @@ class FollowedFace:
     # Where the finder's box lies as the face sees it: its middle from the upright box's (2,) in sides of that, and its
     # size by that's; (3,).
     anchor: Tensor | None = None
+    # Small copies (3,P,P) of the last frame, and of the last one that showed the face.
+    picture: Tensor | None = None
+    shown: Tensor | None = None
     # What is known of it and of somebody who passes before it; see
     # :mod:`~torchface.landmarks.images.person_identity`.
     people: Tensor = field(default_factory=lambda: torch.zeros(IDENTITY))
@@ -33,14 +41,17 @@ class FollowedFace:
     frames: int = 0
     unconfirmed: int = 0  # checks in a row in which the detector saw no face at its place
     covered: bool = False  # whether a landmark was hidden in the last frame
+    change: float = 0.0  # from the picture before to the last one, 1 less their correlation
+    cut: bool = False  # whether a cut came since the face was seen
     # Its colours in the last frame that showed it, upright and small, (1200,) of unit length; not packed.
     latest_look: Tensor | None = None
 
     def pack(self) -> Tensor:
-        """All of it as a tensor (218,) float64; NaN for unknown."""
-        parts = (self.place, 5), (self.anchor, 3), (self.people, IDENTITY)
-        known = [torch.full((size,), torch.nan) if part is None else part.cpu() for part, size in parts]
-        counts = [self.missed, self.frames, self.unconfirmed, self.covered]
+        """All of it as a tensor (1758,) float64; NaN for unknown."""
+        size = 3 * _PARTS**2
+        parts = (self.place, 5), (self.anchor, 3), (self.picture, size), (self.shown, size), (self.people, IDENTITY)
+        known = [torch.full((size,), torch.nan) if part is None else part.cpu().flatten() for part, size in parts]
+        counts = [self.missed, self.frames, self.unconfirmed, self.covered, self.change, self.cut]
         return torch.cat([*(part.double() for part in known), torch.tensor(counts, dtype=torch.float64)])
 
     @classmethod
@@ -48,10 +59,48 @@ class FollowedFace:
         """What :meth:`pack` packed."""
         if packed.shape != (MEMORY,):
             raise ShapeError(f"resume: found a memory of {tuple(packed.shape)}, expected ({MEMORY},)")
-        *parts, people, counts = packed.float().split([5, 3, IDENTITY, 4])
-        place, anchor = (part if bool(torch.isfinite(part).all()) else None for part in parts)
-        missed, frames, unconfirmed, covered = (int(count) for count in counts.nan_to_num(0.0))
-        return cls(place, anchor, people.nan_to_num(0.0), missed, frames, unconfirmed, covered > 0)
+        size = 3 * _PARTS**2
+        *parts, people, counts = packed.float().split([5, 3, size, size, IDENTITY, 6])
+        place, anchor, picture, shown = (part if bool(torch.isfinite(part).all()) else None for part in parts)
+        picture, shown = (None if part is None else part.view(3, _PARTS, _PARTS) for part in (picture, shown))
+        missed, frames, unconfirmed, covered, change, cut = counts.nan_to_num(0.0).tolist()
+        return cls(
+            place,
+            anchor,
+            picture,
+            shown,
+            people.nan_to_num(0.0),
+            int(missed),
+            int(frames),
+            int(unconfirmed),
+            covered > 0,
+            change,
+            cut > 0,
+        )
+
+    def take_picture(self, image: Tensor) -> None:
+        """Notes how a frame (H,W) or (3,H,W) looks, and whether a cut lies before it."""
+        step = max(1, min(image.shape[-2:]) // _SAMPLES)
+        picture = adaptive_avg_pool2d(image[..., ::step, ::step].float().expand(3, -1, -1), _PARTS)
+        change = 0.0 if self.picture is None else 1 - float(face_look(picture) @ face_look(self.picture))
+        self.cut |= change > max(_CUT, _SUDDEN * self.change)
+        self.picture, self.change = picture, change
+
+    def is_new(self, box: Tensor, shape: torch.Size) -> bool:
+        """Whether the last frame, of a shape (...,H,W), shows something else in a box (4,) than when the face was
+        seen."""
+        if self.picture is None or self.shown is None:
+            return True
+        cell = box.new_tensor([shape[-1], shape[-2]]) / _PARTS
+        left, top = (box[:2] / cell).floor().clamp(0, _PARTS - 2).int().tolist()
+        right, bottom = ((box[:2] + box[2:]) / cell).ceil().clamp(2, _PARTS).int().tolist()
+        now, then = (face_look(one[:, top:bottom, left:right]) for one in (self.picture, self.shown))
+        return float(now @ then) < _UNCHANGED
+
+    def forget_place(self) -> None:
+        """After a cut: it is known how the face looks, and no more."""
+        self.place = self.anchor = None
+        self.people = look_alone(self.people)
 
     def set_anchor(self, box: Tensor) -> None:
         """Notes where the box (4,) lies that the face, whose place is known, was found in."""

@@ -16,16 +16,19 @@ from torchface.landmarks.images.landmark_finder import LandmarkFinder, find_in_b
 from torchface.landmarks.images.person_identity import (
     CANDIDATES,
     LOOK_SIZE,
+    SAME,
     after_boxes,
     after_face,
     counted_beside,
     is_awaited,
     is_beside,
     is_other,
+    known_look,
 )
 from torchface.landmarks.images.tracking.followed_face import LOOK, FollowedFace, face_place, look_at
 from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
 from torchface.landmarks.images.trees.tree_finder import TreeFinder
+from torchface.number_checks import check_rate
 
 _SAME_PLACE, _UNMOVED, _CONFIRMED = 0.5, 0.75, 0.4  # overlaps of boxes
 _MOST_TRIED = 4  # boxes of a search beside those of the larger faces
@@ -39,9 +42,8 @@ _LEAST_CONFIDENCE, _CHECKS, _CHECK_EVERY = 0.44, 3, 16
 # Frames after which it is asked who else is about, and after which where a landmark is less visible than the third; and
 # pixels of the followed face's side in the copy that it is shown for that.
 _COUNT_EVERY, _COVERED_EVERY, _HIDDEN, _ENOUGH = 4, 2, 0.3, 48.0
-_FRAMES_WAITED = 10  # for a lost face at its place before another is taken
+_WAITED = 1 / 3  # seconds for a lost face at its place before another is taken
 _LEAST_SIDE = 12.0  # of a box, pixels, under which a face is lost
-_INTERVAL = torch.tensor(1 / 30)  # seconds that a frame counts
 
 
 class LandmarkTracker:
@@ -50,6 +52,7 @@ class LandmarkTracker:
     The face is looked for in the box round the landmarks of the frame before, turned as they are. A finder that places
     landmarks a little too high would climb with every frame: so the box lies to the landmarks as it did when the face
     was found. Where the finder doubts that the box shows a face the detector looks for it, near where it was first.
+    After a cut it may be anywhere: of several that were not there before the one is taken that looks most alike.
 
     Args:
         finder: finds 68 landmarks in a box; landmark trees do so from several starts.
@@ -57,9 +60,10 @@ class LandmarkTracker:
         detector: finds boxes; see ``find_faces``.
         face: which one, from 0, the largest first, where the first frame that shows one shows several. It stays with
             that face while others come and go.
+        fps: frames a second.
 
     Raises:
-        ValueRangeError: trees find other landmarks than the 68, or ``face`` is negative.
+        ValueRangeError: trees find other landmarks than the 68, ``face`` is negative, or ``fps`` is no camera's.
 
     Example:
         >>> from torchface import zoo
@@ -74,9 +78,12 @@ class LandmarkTracker:
         appearance: AppearanceModel | None = None,
         detector: FaceDetector | None = None,
         face: int = 0,
+        fps: float = 30.0,
     ) -> None:
         if face < 0:
             raise ValueRangeError(f"face: found {face}, expected a number from 0")
+        check_rate(fps, "fps", ValueRangeError)
+        self._interval = torch.tensor(1 / fps)
         self.finder: LandmarkFinder = TreeFinder(finder) if isinstance(finder, LandmarkTrees) else finder
         self.appearance, self.face = appearance, face
         self.detector = detector or shipped_detector()
@@ -92,7 +99,7 @@ class LandmarkTracker:
 
     @property
     def memory(self) -> Tensor:
-        """What the next frame needs of those before it, (218,) float64."""
+        """What the next frame needs of those before it, (1758,) float64."""
         return self._followed.pack()
 
     @property
@@ -107,7 +114,7 @@ class LandmarkTracker:
         return counted_beside(self._followed.people)
 
     def resume(self, memory: Tensor) -> None:
-        """Goes on as a tracker would that has just had this :attr:`memory`, (218,).
+        """Goes on as a tracker would that has just had this :attr:`memory`, (1758,).
 
         Raises:
             ShapeError: another shape.
@@ -128,11 +135,12 @@ class LandmarkTracker:
         followed = self._followed
         followed.frames += 1
         self._faces = None
+        followed.take_picture(frame)
         every = _COVERED_EVERY if followed.covered else _COUNT_EVERY
         check = followed.missed > 0 or followed.frames % every == 0 or bool(is_beside(followed.people))
         self._nearby = self._about(frame) if check else torch.zeros(CANDIDATES, 4)
-        followed.people = after_boxes(followed.people, self._nearby, torch.tensor(check), _INTERVAL)
-        before = self._follow(frame) if followed.missed == 0 else None
+        followed.people = after_boxes(followed.people, self._nearby, torch.tensor(check), self._interval)
+        before = self._follow(frame) if followed.missed == 0 and not followed.cut else None
         face = before if before is not None and self._is_person(frame, before) else self._search(frame)
         if face is None:
             followed.missed += 1
@@ -143,6 +151,7 @@ class LandmarkTracker:
         place = followed.place = self._place(refined.landmarks)
         if face is not before:
             followed.set_anchor(face.search_box)
+        followed.shown, followed.cut = followed.picture, False
         followed.covered = bool(face.visibility.amin() < _HIDDEN)
         followed.latest_look = look_at(frame, place)
         return refined
@@ -175,8 +184,8 @@ class LandmarkTracker:
         """Whether a face is the followed person's, and not somebody's who passes before them; notes whose it is."""
         people, around = self._followed.people, place_around(face.landmarks)
         look = look_at(frame, self._place(face.landmarks), LOOK_SIZE)
-        other = is_other(people, around, look, _INTERVAL)
-        self._followed.people = after_face(people, around, look, (~other, other), _INTERVAL)
+        other = is_other(people, around, look, self._interval)
+        self._followed.people = after_face(people, around, look, (~other, other), self._interval)
         return not bool(other)
 
     def _face_in(self, frame: Tensor, faces: FaceBoxes, number: int) -> FaceReading | None:
@@ -226,7 +235,7 @@ class LandmarkTracker:
         """The face wherever it is now; None where it is nowhere."""
         followed = self._followed
         face = self._chosen(frame, self._found(frame))
-        if face is None and followed.place is not None and 0 < followed.missed < _FRAMES_WAITED:
+        if face is None and followed.place is not None and (followed.missed > 0 or followed.cut) and self._waits():
             face = self._still_there(frame, followed.place)
         if face is not None:
             followed.unconfirmed = 0
@@ -235,24 +244,47 @@ class LandmarkTracker:
     def _is_sure(self, face: FaceReading) -> bool:
         return float(face.presence) >= _SURE_PRESENCE
 
+    def _waits(self) -> bool:
+        """Whether the face is expected where it was, and nobody elsewhere is taken for it yet."""
+        followed = self._followed
+        if followed.place is None:
+            return False
+        if bool(is_beside(followed.people)):  # whoever is hidden behind somebody comes out again
+            return bool(is_awaited(followed.people))
+        return followed.missed * float(self._interval) < _WAITED
+
     def _chosen(self, frame: Tensor, faces: FaceBoxes) -> FaceReading | None:
         """The one of these faces that is meant, if it is one."""
-        followed = self._followed
-        near = followed.near(faces.boxes)
-        # Whoever is hidden behind somebody comes out again.
-        hidden, awaited = is_beside(followed.people), is_awaited(followed.people)
-        waits = followed.place is not None and bool(awaited if hidden else followed.missed < _FRAMES_WAITED)
-        if not near and (waits or self.face >= len(faces)):
+        near = self._followed.near(faces.boxes)
+        if near:
+            found = (self._face_in(frame, faces, number) for number in near)
+            own = next((face for face in found if face is not None and self._is_person(frame, face)), None)
+            if own is not None or not self._followed.cut:
+                return own
+        known, waits = known_look(self._followed.people), self._waits()
+        hidden = waits and not self._followed.cut and bool(is_beside(self._followed.people))
+        if hidden or self.face >= len(faces):
             return None
-        skipped = 0 if near else self.face
-        for number in near or range(min(len(faces), self.face + _MOST_TRIED)):  # a box may show no face
-            face = self._face_in(frame, faces, number)
-            if face is None or not (near or float(face.presence) >= _NEW_PRESENCE):
-                continue
-            if skipped == 0 and self._is_person(frame, face):
-                return face
-            skipped -= skipped > 0
-        return None
+        shown = self._shown(frame, faces)
+        if known.any():
+            looks = [float(known @ look_at(frame, self._place(face.landmarks), LOOK_SIZE)) for face in shown]
+            alike = sorted(zip(looks, shown, strict=True), key=lambda one: -one[0])
+            shown = [face for look, face in alike if not waits or self._came(frame, face, look)]
+        else:
+            shown = shown[self.face :]
+        if waits and shown:
+            self._followed.forget_place()
+        return next((face for face in shown if self._is_person(frame, face)), None)
+
+    def _shown(self, frame: Tensor, faces: FaceBoxes) -> list[FaceReading]:
+        """The largest of these faces with their landmarks, those that are faces."""
+        numbers = range(min(len(faces), self.face + _MOST_TRIED))  # a box may show no face
+        found = (self._face_in(frame, faces, number) for number in numbers)
+        return [face for face in found if face is not None and float(face.presence) >= _NEW_PRESENCE]
+
+    def _came(self, frame: Tensor, face: FaceReading, likeness: float) -> bool:
+        """Whether a face elsewhere came with a cut, or looks like the one that is missed and was not there before."""
+        return (self._followed.cut or likeness >= SAME) and self._followed.is_new(face.box, frame.shape)
 
     def _still_there(self, frame: Tensor, place: Tensor) -> FaceReading | None:
         """The face where it was lost (5,), though the detector sees none: turned or half hidden."""
