@@ -52,6 +52,9 @@ _SKIN = (0.80, 0.55, 0.48)  # whose hue the light of photographs is judged by wh
 # in shadow differ more.
 _FOLDS, _PORES, _FRAMED_SKIN = (0.8, 0.12), (0.2, 0.06), (0.06, 0.04)
 _GLASS, _GLASSES, _FRAMED = 0.3, 0.03, 0.5  # shares: of a place, of the places where frames lie, of those that count
+# Of the eyes' outer corners' distance; share of glasses at a place of the bridge, of 11 faces without at most 0.12, and
+# of its places.
+_BRIDGE, _ON_BRIDGE, _OF_BRIDGE = 0.1, 0.2, 0.1
 _BROW_ENDS = 0.6, 0.95  # shares of skin between which hair of brows and beards ends
 # Lips and cheeks keep light from teeth: shares at the front and far back, and millimetres behind the foremost.
 _TEETH_LIGHT, _TEETH_BACK = (0.85, 0.3), (4.0, 28.0)
@@ -223,6 +226,10 @@ def _spectacles(views: Sequence[_View], glasses: Sequence[Tensor]) -> Tensor:
         for view, share, frame in zip(views, glasses, frames, strict=True)
     ]
     worn = any(float((share.nan_to_num(0.0) > _GLASS).float().mean()) > _GLASSES for share in seen if len(share))
+    # In small faces thin frames show on the bridge of the nose alone.
+    for view, share in zip(views, glasses, strict=True):
+        bridge = (view.places.place[:, :2].abs() < _BRIDGE).all(1) & (view.shown.cosine > 0)
+        worn = worn or bool((share[bridge].nan_to_num(0.0) > _ON_BRIDGE).float().mean() > _OF_BRIDGE)
     return frames[0] * worn
 
 
