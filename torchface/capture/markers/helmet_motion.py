@@ -15,8 +15,9 @@ _ARM = 30.0
 _ENOUGH = 6  # markers from which a motion is known beside the expression's
 _ROUNDS, _NEAR = 4, 2.0  # millimetres: what is nearer counts in full
 _SHAPE_ROUNDS = 3
-# Of the markers' mean distance from their centre: farther no helmet slips; in fewer frames markers are wrong.
-_SLIPS, _SHARE_MOVES = 0.3, 0.05
+# Of the markers' mean distance from their centre: farther no helmet slips, and expressions alone seem to move a head by
+# less than the second. In fewer frames than the last share markers are wrong.
+_SLIPS, _EXPRESSIONS, _SHARE_MOVES = 0.3, 0.2, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,9 +104,9 @@ def rough_motion(seen: Tensor, rest: Tensor) -> tuple[HelmetMotion, Tensor]:
     return found, rows
 
 
-def free_motion(seen: Tensor) -> HelmetMotion | None:
-    """The motion of a head that moves freely in a volume, from its markers (T,M,3) alone; None where a helmet slips,
-    whose motion is solved for with the weights.
+def free_motion(seen: Tensor, least: float = _SLIPS) -> HelmetMotion | None:
+    """The motion of a head that moves freely in a volume, from its markers (T,M,3) alone; None where it moves them by
+    less than ``least`` of their mean distance from their centre, as a helmet that slips.
 
     Frames are moved rigidly onto the shape that they have in the middle, which strong expressions bend: what is left is
     up to 20 degrees where the jaw opens wide, as a helmet's slip. Frames that show too few markers move as the nearest
@@ -119,7 +120,7 @@ def free_motion(seen: Tensor) -> HelmetMotion | None:
         shape = found.undo(seen)[rows].nanmedian(0).values
     path = found.apply(shape.expand(len(seen), -1, -1))[rows]
     away = (path - path.median(0).values).norm(dim=-1).nanmean(1)
-    if float(away.quantile(1 - _SHARE_MOVES)) < _SLIPS * float((shape - shape.nanmean(0)).norm(dim=1).nanmean()):
+    if float(away.quantile(1 - _SHARE_MOVES)) < least * float((shape - shape.nanmean(0)).norm(dim=1).nanmean()):
         return None
     found, rows = rough_motion(seen, path[away.argmin()])
     nearest = rows[nearest_rows(rows, len(seen))]
@@ -127,10 +128,13 @@ def free_motion(seen: Tensor) -> HelmetMotion | None:
 
 
 def steady_take(take: Take) -> tuple[Take, HelmetMotion | None]:
-    """A take without :func:`free_motion` of its markers, and that motion; as it is where there is none."""
+    """A take without the rigid motion of its markers, and that motion; as it is where expressions may be all there is.
+
+    A slipping helmet's motion is taken out, too: what is left of either is solved for with the weights.
+    """
     assert take.markers is not None
     values = take.markers.values
-    motion = free_motion(values.double())
+    motion = free_motion(values.double(), _EXPRESSIONS)
     if motion is None:
         return take, None
     return replace(take, markers=replace(take.markers, values=motion.undo(values.double()).to(values))), motion
