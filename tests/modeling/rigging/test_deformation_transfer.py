@@ -232,6 +232,9 @@ def test_what_cannot_be_transferred_is_named() -> None:
     rig = hill_rig()
     with pytest.raises(TopologyError, match=r"found a target of 625 vertices.*expected the source's topology"):
         transfer_deformation(rig, Mesh(rig.vertices, rig.neutral.faces[:-1]))
+    reordered = Mesh(rig.vertices.flip(0), 624 - rig.neutral.faces)
+    with pytest.raises(TopologyError, match=r"625 vertices and 1152 triangles, as many, which join other vertices"):
+        transfer_deformation(rig, reordered)
     with pytest.raises(TopologyError, match="441"):
         transfer_deformation(rig, hill_rig(21).neutral)
     with pytest.raises(ValueRangeError, match="0 shapes"):

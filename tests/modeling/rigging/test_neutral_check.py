@@ -14,6 +14,7 @@ from torchface.io import load_rig, save_mesh, save_rig
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.mesh import Mesh
 from torchface.modeling import neutral_notes
+from torchface.modeling.rigging.neutral_check import pose_notes
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, neutral_head, performer
 
@@ -77,6 +78,24 @@ def test_a_shape_that_is_found_can_be_taken_out(
     made = load_rig(out).vertices.double()[None]
     left = similarity_transform(made, rest, scale=False).apply(made) - rest
     assert left.norm(dim=-1).max() < 0.15 * jaw.norm(dim=-1).max()
+
+
+def test_a_pose_that_a_head_does_not_show_is_named(
+    actor: BlendshapeRig, people: list[Mesh], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name in ("jawOpen", "eyeBlinkLeft", "mouthSmileLeft"):
+        given = torch.zeros(len(actor.names))
+        given[actor.names.index(name)] = 1.0
+        for head in people:
+            (note,) = pose_notes(actor, head, given)
+            assert f"shows nothing of {name}=1" in note
+            there = head.with_vertices(head.vertices + shown(actor, **{name: 1.0}))
+            assert pose_notes(actor, there, given) == pose_notes(actor, there, 0 * given) == ()
+    save_rig(actor.select(["jawOpen", "mouthSmileLeft"]), tmp_path / "template.glb")
+    save_mesh(people[0], tmp_path / "rest.obj")
+    words = [tmp_path / "rest.obj", "--template", tmp_path / "template.glb", "--out", tmp_path / "out.glb"]
+    main(["rig", *map(str, words), "--pose", "jawOpen=1", "--quiet"])
+    assert "warning: the head shows nothing of jawOpen=1" in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_templates_own_expression_is_refused(actor: BlendshapeRig) -> None:

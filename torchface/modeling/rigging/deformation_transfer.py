@@ -154,6 +154,11 @@ def transfer_report(job: ShapeTransfer, names: tuple[str, ...]) -> TransferRepor
     )
 
 
+def _alike(source: Mesh, target: Mesh) -> str:
+    same = len(source.vertices) == len(target.vertices) and len(source.faces) == len(target.faces)
+    return ", as many, which join other vertices: it was exported in another order," if same else ""
+
+
 def _check(source: BlendshapeRig, target: Mesh, contact_weight: float) -> None:
     checked_type("source", source, BlendshapeRig)
     checked_type("target", target, Mesh)
@@ -164,9 +169,9 @@ def _check(source: BlendshapeRig, target: Mesh, contact_weight: float) -> None:
     if source.neutral.fingerprint() != target.fingerprint():
         raise TopologyError(
             f"transfer_deformation: found a target of {len(target.vertices)} vertices and {len(target.faces)} "
-            f"triangles ({target.fingerprint()}), expected the source's topology of {len(source.neutral.vertices)} "
-            f"vertices and {len(source.neutral.faces)} triangles ({source.neutral.fingerprint()}); "
-            "a head of another topology is first laid out in it by "
+            f"triangles{_alike(source.neutral, target)} ({target.fingerprint()}), expected the source's topology of "
+            f"{len(source.neutral.vertices)} vertices and {len(source.neutral.faces)} triangles "
+            f"({source.neutral.fingerprint()}); a head of another topology is first laid out in it by "
             "torchface register, or rigged at once by torchface rig"
         )
     for what, vertices in (("source", source.vertices), ("target", target.vertices)):

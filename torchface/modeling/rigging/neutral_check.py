@@ -16,6 +16,7 @@ from torchface.rig import BlendshapeRig
 # characters); of all shapes at full strength 80 to 85 %, of blinks, smiles, puckers, brows and open jaws 96 to 100 %.
 _WEIGHT, _SHARE, _WAY = 0.2, 0.35, 4.0  # the way in millimetres at the template's size
 _RIDGE, _EXACT_RIDGE = 0.1, 1e-6  # of H's diagonal: jawLeft and jawRight together explain what no face shows
+_SEEN = 0.15  # of the weight given: less is nothing; shapes that are there are found by 0.3 of it and more
 _OWN_HEAD = 0.01  # of the squared difference is left where the head is the template's own
 _SQUEEZED, _AFFINE_SHARE = 1.3, 0.7  # of heads at rest 1.21 and 0.67 at most
 _TURNED = 30.0  # degrees; heads at rest 11 at most
@@ -71,38 +72,59 @@ def _affine(rest: Tensor, goal: Tensor) -> tuple[Tensor, float]:
     return affine, float(1 - left / before.clamp(min=1e-12))
 
 
-def _expression_notes(template: BlendshapeRig, rest: Tensor, goal: Tensor) -> list[str]:
-    r"""Which of a template's shapes are in a head (V,3) in the template's place.
+def pose_notes(template: BlendshapeRig, head: Mesh, shown: Tensor) -> tuple[str, ...]:
+    """A sentence where a head of the template's topology shows little or nothing of the weights (N,) that it is said to
+    show."""
+    if not bool(shown.any()):
+        return ()
+    rest, goal = (mesh.vertices.detach().cpu().double() for mesh in (template.neutral, head))
+    used = template.neutral.faces.cpu().unique()
+    fit = _EdgeFit(template, rest, similarity_transform(goal[None, used], rest[None, used]).apply(goal[None])[0])
+    found, given = fit.weights(_RIDGE), shown.detach().cpu().double()
+    missing = ((given * fit.way > _WAY) & (found < _SEEN * given)).nonzero()[:, 0].tolist()
+    named = " ".join(f"{template.names[i]}={float(given[i]):g}" for i in missing[:_NAMED])
+    return (f"the head shows nothing of {named}, and its neutral is wrong there; leave it out of --pose",) * bool(named)
+
+
+class _EdgeFit:
+    r"""How a template's shapes explain a head (V,3) in the template's place.
 
     .. math:: \min_{0 \le w \le 1} \sum_e \tfrac{1}{l_e} \lVert \Delta_e(y - x) - \sum_i w_i \Delta_e d_i \rVert^2
 
     over the edges e of length l, with a ridge. Faces of people differ smoothly, so their edges differ little.
     """
-    deltas = template.deltas.detach().cpu().double()
-    ends = edges(template.neutral.faces.cpu())
-    root = rest[ends].diff(dim=1)[:, 0].norm(dim=-1).clamp(min=_SHORTEST * extent(rest)).sqrt()[:, None]
-    shapes = deltas[:, ends].diff(dim=2)[:, :, 0] / root
-    acts = shapes.square().sum(-1).amax(0) > 0
-    shapes, off = shapes[:, acts], ((goal - rest)[ends].diff(dim=1)[:, 0] / root)[acts]
-    flat, total = shapes.flatten(1), off.square().sum()
-    H, f = flat @ flat.T, -(flat @ off.flatten())
 
-    def weights(ridge: float) -> Tensor:
-        return box_qp(H + (ridge * H.diagonal()).diag(), f[None])[0]
+    def __init__(self, template: BlendshapeRig, rest: Tensor, goal: Tensor) -> None:
+        deltas = template.deltas.detach().cpu().double()
+        ends = edges(template.neutral.faces.cpu())
+        root = rest[ends].diff(dim=1)[:, 0].norm(dim=-1).clamp(min=_SHORTEST * extent(rest)).sqrt()[:, None]
+        shapes = deltas[:, ends].diff(dim=2)[:, :, 0] / root
+        acts = shapes.square().sum(-1).amax(0) > 0
+        self.shapes, self.off = shapes[:, acts], ((goal - rest)[ends].diff(dim=1)[:, 0] / root)[acts]
+        self.way = deltas.norm(dim=-1).amax(1)
+        flat = self.shapes.flatten(1)
+        self._H, self._f = flat @ flat.T, -(flat @ self.off.flatten())
 
-    def left(found: Tensor) -> Tensor:
-        return (off - torch.tensordot(found, shapes, 1)).square().sum(-1)
+    def weights(self, ridge: float) -> Tensor:
+        return box_qp(self._H + (ridge * self._H.diagonal()).diag(), self._f[None])[0]
 
-    found, way = weights(_RIDGE), deltas.norm(dim=-1).amax(1)
-    energy = shapes.square().sum(-1)
+    def left(self, weights: Tensor) -> Tensor:
+        """What the weights leave of each edge's squared difference."""
+        return (self.off - torch.tensordot(weights, self.shapes, 1)).square().sum(-1)
+
+
+def _expression_notes(template: BlendshapeRig, rest: Tensor, goal: Tensor) -> list[str]:
+    """Which of a template's shapes are in a head (V,3) in the template's place."""
+    fit = _EdgeFit(template, rest, goal)
+    found, way, energy = fit.weights(_RIDGE), fit.way, fit.shapes.square().sum(-1)
     where = energy / energy.amax(1, keepdim=True).clamp(min=1e-12)
     signal = found.square() * (energy * where).sum(1)
-    share = signal / (signal + where @ left(found)).clamp(min=1e-12)
+    share = signal / (signal + where @ fit.left(found)).clamp(min=1e-12)
     there = (found > _WEIGHT) & (share > _SHARE) & (found * way > _WAY)
     if not bool(there.any()):
         return []
-    exact = weights(_EXACT_RIDGE)
-    own = float(left(exact).sum() / total) < _OWN_HEAD
+    exact = fit.weights(_EXACT_RIDGE)
+    own = float(fit.left(exact).sum() / fit.off.square().sum()) < _OWN_HEAD
     values = exact if own else found
     order = [i for i in (values * way).argsort(descending=True).tolist() if there[i]][:_NAMED]
     named = " ".join(f"{template.names[i]}={float(values[i]):.1f}" for i in order)

@@ -42,6 +42,7 @@ from torchface.modeling import (
     transfer_with_report,
 )
 from torchface.modeling.rigging.example_rigging import RiggingSchedule
+from torchface.modeling.rigging.neutral_check import pose_notes
 from torchface.modeling.rigging.part_clearance import penetration
 from torchface.modeling.rigging.part_placement import with_mouth_behind_skin, with_placed_parts
 from torchface.progress import Progress, silent
@@ -162,11 +163,13 @@ def _rig_actor(
         # Before it is drawn: teeth and eyes of the other are where they belong.
         as_shown = BlendshapeRig(job.posed(rig, shown), rig.deltas, rig.names)
         registration = with_placed_parts(as_shown, registration)
-    neutral = _at_rest(rig, shown, _upright(registration, rig.neutral))
+    found = _upright(registration, rig.neutral)
+    neutral = _at_rest(rig, shown, found)
     if bent and bool(shown.any()):
         neutral = with_mouth_behind_skin(place_parts(rig, neutral, parts))
     transferred = transfer_with_report(rig, neutral, progress=progress)
-    notes = (*registration.record.notes, *(f"warning: {note}" for note in neutral_notes(rig, neutral)))
+    doubts = (*pose_notes(rig, found, shown), *neutral_notes(rig, neutral))
+    notes = (*registration.record.notes, *(f"warning: {note}" for note in doubts))
     registration = replace(registration, record=replace(registration.record, notes=notes))
     actor: BlendshapeRig = transferred.rig
     predicted = None if regression is None else neutral_rig(regression, rig, neutral)
