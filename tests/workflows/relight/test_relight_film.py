@@ -246,6 +246,16 @@ def test_paint_lies_behind_the_hand_too(filmed: Filmed, tmp_path: Path) -> None:
     assert cheek[1] > 2 * cheek[0]
 
 
+def test_frames_of_a_variable_rate_keep_their_times(filmed: Filmed, tmp_path: Path) -> None:
+    times = torch.tensor([0.0, 0.033, 0.066, 0.1, 0.2, 0.3, 0.4], dtype=torch.float64)
+    film = write_video(open_video(filmed.film).color_chunks(8), tmp_path / "phone.mp4", 15.0, times)
+    lines = relight_film(film.path, filmed.track, tmp_path / "relit.mp4", RelightSettings(light=("azimuth=10",)))
+    assert not any("sound" in line for line in lines)
+    found, _ = open_video(tmp_path / "relit.mp4").uneven_seconds()
+    assert found is not None
+    torch.testing.assert_close(found, times, atol=0.001, rtol=0)
+
+
 def test_what_does_not_fit_is_named(filmed: Filmed, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out, light = tmp_path / "out.avi", RelightSettings(light=("azimuth=10",))
     short = tmp_path / "short.avi"

@@ -20,6 +20,7 @@ from torchface.files.whole_files import checked_size
 if TYPE_CHECKING:
     from av.container import InputContainer
     from av.packet import Packet
+    from av.stream import Stream
     from av.video.frame import VideoFrame
     from av.video.stream import VideoStream
 
@@ -34,7 +35,7 @@ class Packets:
     end: float  # when the last packet of any stream ends, sound too, seconds; 0 where none says
 
 
-def packets_of(container: InputContainer, stream: VideoStream | None, errors: list[str]) -> Iterator[Packet | None]:
+def packets_of(container: InputContainer, stream: Stream | None, errors: list[str]) -> Iterator[Packet | None]:
     """A stream's packets, or all streams', up to the first that cannot be read, then None, which flushes a decoder.
 
     What is wrong with that one goes to ``errors``. Empty packets, which stand for a repeated frame, are left out: a

@@ -13,12 +13,14 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.whole_files import check_ending, replaced_file
+from torchface.io.video.film_sound import add_sound
 from torchface.io.video.video_file import VideoFile, open_video
 from torchface.io.video.video_packets import pyav, read_packets, reason
 from torchface.number_checks import check_rate
 
 if TYPE_CHECKING:
     from av.container import OutputContainer
+    from av.packet import Packet
     from av.video.stream import VideoStream
 
 _FORMATS = {".avi": "avi", ".mkv": "matroska", ".mp4": "mp4"}
@@ -26,9 +28,16 @@ WRITTEN_ENDINGS = tuple(_FORMATS)  # of videos that are written
 _BT709, _LIMITED = 1, 1  # H.273's numbers of matrix, primaries and transfer; FFmpeg's of the range
 _LOSSY = ("yuv420p", "yuv444p")
 _MAX_MPEG4_TICKS, _MAX_BIT_RATE = 65535, 2**30
+_TICK = Fraction(1, 60000)  # seconds in which uneven times are counted
 
 
-def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> VideoFile:
+def write_video(
+    frames: Iterable[Tensor],
+    path: str | Path,
+    fps: float,
+    times: Tensor | None = None,
+    sound: str | Path | None = None,
+) -> VideoFile:
     """Writes frames and reads the file back; it appears only when it is complete.
 
     Args:
@@ -36,10 +45,12 @@ def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> Video
             floats in [0,1]; all of one size, all grey or all in colour. Three dimensions are always grey: a single
             frame in colour is (1,3,H,W).
         path: ``.avi`` and ``.mkv`` are lossless (FFV1), ``.mp4`` (H.264, or MPEG-4 where FFmpeg lacks x264) is not.
-        fps: frames a second.
+        fps: frames a second; in the mean, where there are ``times``.
+        times: when each frame is shown, (T,) seconds, rising from 0; evenly if absent. ``.avi`` cannot hold them.
+        sound: a film whose sound is copied as it is; left out where the file cannot hold its codec.
 
     Raises:
-        FileFormatError: another ending, or the file cannot be written.
+        FileFormatError: another ending, or the file cannot be written or cannot hold ``times``.
         ShapeError: no frames, frames that differ in size, or grey ones among those in colour.
         ValueRangeError: ``fps`` is no camera's.
 
@@ -51,6 +62,8 @@ def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> Video
     path = Path(path)
     check_ending(path, *WRITTEN_ENDINGS)
     check_rate(fps, "fps", ValueRangeError)
+    if times is not None and path.suffix.lower() == ".avi":
+        raise FileFormatError(f"{path}: .avi holds frames at an even rate alone, expected .mp4 or .mkv for others")
     single = _single(frames)
     first = next(single, None)
     if first is None:
@@ -59,7 +72,9 @@ def write_video(frames: Iterable[Tensor], path: str | Path, fps: float) -> Video
     with replaced_file(path) as temporary:
         try:
             with av.open(str(temporary), "w", format=_FORMATS[path.suffix.lower()]) as container:
-                count = _encode(container, first, single, fps)
+                stream = _add_stream(container, first, fps, times)
+                heard = iter(()) if sound is None else add_sound(Path(sound), container)
+                count = _encode(container, stream, chain([first], single), times, heard)
         except av.FFmpegError as error:
             if isinstance(error, OSError):
                 raise
@@ -96,28 +111,40 @@ def _check_written(expected: VideoFile, temporary: Path) -> None:
         )
 
 
-def _encode(container: "OutputContainer", first: Tensor, others: Iterator[Tensor], fps: float) -> int:
-    """Writes all frames and gives their number."""
-    stream = _add_stream(container, first, fps)
-    layout = "rgb24" if first.ndim == 3 else "gray"
+def _encode(
+    container: "OutputContainer",
+    stream: "VideoStream",
+    frames: Iterator[Tensor],
+    times: Tensor | None,
+    sound: "Iterator[tuple[float, Packet]]",
+) -> int:
+    """Writes all frames, and packets of sound between them, and gives the number of frames."""
     lossy = {"dst_colorspace": _BT709, "dst_color_range": _LIMITED} if stream.pix_fmt in _LOSSY else {}
     av = pyav()
     reformatter = av.video.reformatter.VideoReformatter()
-    count = 0
-    for frame in chain([first], others):  # the encoder takes one frame at a time
-        if frame.shape != first.shape:
-            raise ShapeError(f"frames: found {tuple(frame.shape)}, expected {tuple(first.shape)} as the first")
+    count, size, heard = 0, None, next(sound, None)
+    for frame in frames:  # the encoder takes one frame at a time
+        size = size or frame.shape
+        if frame.shape != size:
+            raise ShapeError(f"frames: found {tuple(frame.shape)}, expected {tuple(size)} as the first")
         pixels = frame.numpy() if frame.dtype == torch.uint8 else to_bytes(frame).numpy()
         pixels = np.ascontiguousarray(pixels if pixels.ndim == 2 else pixels.transpose(1, 2, 0))
+        layout = "rgb24" if pixels.ndim == 3 else "gray"
         coded = reformatter.reformat(av.VideoFrame.from_ndarray(pixels, layout), format=stream.pix_fmt, **lossy)
-        coded.pts, coded.time_base = count, 1 / stream.codec_context.framerate
+        coded.time_base = stream.codec_context.time_base
+        coded.pts = count if times is None else round(float(times[count]) / coded.time_base)
         container.mux(stream.encode(coded))
         count += 1
+        while heard is not None and heard[0] <= coded.pts * coded.time_base:
+            container.mux(heard[1])
+            heard = next(sound, None)
     container.mux(stream.encode(None))
+    for _, packet in () if heard is None else chain([heard], sound):
+        container.mux(packet)
     return count
 
 
-def _add_stream(container: "OutputContainer", first: Tensor, fps: float) -> "VideoStream":
+def _add_stream(container: "OutputContainer", first: Tensor, fps: float, times: Tensor | None) -> "VideoStream":
     """A stream for frames as the first: FFV1 for a lossless container, else H.264 or MPEG-4 in BT.709."""
     height, width = first.shape[-2:]
     lossless = container.format.name != "mp4"
@@ -126,6 +153,7 @@ def _add_stream(container: "OutputContainer", first: Tensor, fps: float) -> "Vid
     options = {"preset": "superfast", "crf": "16", "x264-params": "mbtree=0"} if codec == "libx264" else {}
     stream = cast("VideoStream", container.add_stream(codec, rate=_rate(fps, codec), options=options))
     stream.width, stream.height = width, height
+    stream.codec_context.time_base = 1 / stream.codec_context.framerate if times is None else _TICK
     if lossless:
         stream.pix_fmt = "bgr0" if first.ndim == 3 else "gray"
         return stream

@@ -17,6 +17,7 @@ from torchface.files.whole_files import check_ending, check_writable
 from torchface.io.images.image_files import load_paint
 from torchface.io.images.radiance_hdr import load_panorama
 from torchface.io.video import open_video, write_video
+from torchface.io.video.film_sound import sound_line
 from torchface.io.video.video_writing import WRITTEN_ENDINGS
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.mesh import Mesh
@@ -145,7 +146,8 @@ def relight_film(
                 at += 1
                 progress("relighting", at, tracked.video.count)
 
-    write_video(drawn(), out, tracked.video.fps)
+    write_video(drawn(), out, tracked.video.fps, tracked.video.uneven_seconds()[0], film)
+    lines += sound_line(film, out)
     if max(hidden, default=0.0) > _LEAST_HIDDEN:
         lines.append(
             f"hands or glasses cover {max(hidden):.0%} of the picture of the face at most; they stay as they are"

@@ -1,6 +1,6 @@
 """A film with what ``torchface track`` found in it: the rig, its weights and the head's pose in every frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
@@ -59,7 +59,7 @@ def read_tracked_film(film: Path, track: Path) -> TrackedFilm:
     for name in (SUMMARY, LANDMARKS, ANIMATION):
         if not (track / name).is_file():
             raise FileFormatError(f"{track}: found no {name}, expected the folder that `torchface track` wrote")
-    video, record = open_video(film), read_json(track / SUMMARY, SUMMARY_FORMAT)
+    video, record = replace(open_video(film), even=False), read_json(track / SUMMARY, SUMMARY_FORMAT)
     marks, animation = load_landmarks_csv(track / LANDMARKS), load_animation(track / ANIMATION)
     if animation is None or animation.weights is None or marks.landmarks is None:
         raise FileFormatError(f"{track / ANIMATION}: found no weights over time, expected those of `torchface track`")

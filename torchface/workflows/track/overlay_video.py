@@ -37,7 +37,7 @@ def write_overlay(tracked: Tracked, path: Path, progress: Progress) -> None:
             yield draw(at, frame)[None]
             progress("drawing the overlay", at + 1, len(tracked))
 
-    write_video(drawn(), path, tracked.video.fps)
+    write_video(drawn(), path, tracked.video.fps, tracked.times, tracked.video.path)
 
 
 def side_by_side_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:

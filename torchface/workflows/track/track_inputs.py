@@ -32,7 +32,7 @@ Overlay = Literal["side", "over", "none"]
 """The opaque rig beside the picture, the mesh half through over it, or no video."""
 
 _SIDES = (1, 2**16)
-_AT_ITS_TIMES = "solved at the frames' own times; the overlay runs at the mean rate"
+_AT_ITS_TIMES = "solved at the frames' own times"
 
 
 @dataclass(frozen=True)

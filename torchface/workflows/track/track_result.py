@@ -218,8 +218,8 @@ class Tracked:
             )
         if self.times is not None:
             lines.append(
-                f"variable frame rate: {self.inputs.rate_varies}; weights.csv and animation.glb have the frames' own "
-                f"times, the overlay runs at {self.video.fps:.2f} frames a second"
+                f"variable frame rate: {self.inputs.rate_varies}; weights.csv, animation.glb and the overlay have the "
+                "frames' own times"
             )
         if self.calibration.assumed:
             lines.append(

@@ -1,0 +1,103 @@
+"""A written film has the sound of the film that it was made from, in step with its pictures."""
+
+from fractions import Fraction
+from pathlib import Path
+
+import av
+import numpy as np
+import pytest
+import torch
+
+from torchface.errors import FileFormatError
+from torchface.io.video import open_video, write_video
+from torchface.io.video.film_sound import sound_codec, sound_line
+
+RATE, EVENT = 48000, 0.8  # of the sound; seconds after the first frame at which it turns white, and a tone begins
+EVEN = [t / 30 for t in range(45)]
+SLOWER = [t / 30 if t < 24 else 0.8 + (t - 24) / 15 for t in range(45)]
+
+
+def film(path: Path, codec: str, times: list[float], begin: float = 0.0) -> Path:
+    """A film whose first frame is shown at ``begin`` seconds."""
+    tick = Fraction(1, 1000)
+    with av.open(str(path), "w") as container:
+        pictures = container.add_stream("libvpx-vp9" if path.suffix == ".webm" else "libx264", rate=30)
+        pictures.width, pictures.height, pictures.pix_fmt = 64, 48, "yuv420p"
+        pictures.codec_context.time_base = tick
+        sound = container.add_stream(codec, rate=RATE)
+        sound.layout = "mono"
+        for time in times:
+            level = 250 if time >= EVENT - 1e-6 else 20
+            frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), level, np.uint8), format="rgb24")
+            frame.pts, frame.time_base = round(1000 * (begin + time)), tick
+            container.mux(pictures.encode(frame))
+        container.mux(pictures.encode(None))
+        at = np.arange(int(RATE * (begin + times[-1]))) / RATE
+        wave = (np.sin(2 * np.pi * 880 * at) * 0.5 * (at >= begin + EVENT)).astype(np.float32)
+        samples = av.AudioFrame.from_ndarray(wave[None], format="fltp", layout="mono")
+        samples.sample_rate, samples.pts, samples.time_base = RATE, 0, Fraction(1, RATE)
+        resampler = av.AudioResampler(sound.codec_context.format.name, "mono", RATE, sound.codec_context.frame_size)
+        for piece in [*resampler.resample(samples), *resampler.resample(None)]:
+            container.mux(sound.encode(piece))
+        container.mux(sound.encode(None))
+    return path
+
+
+def events(path: Path) -> tuple[float, float]:
+    """When the picture turns white and when the tone begins, seconds."""
+    with av.open(str(path)) as container:
+        frames = ((float(frame.time), frame.to_ndarray(format="gray").mean()) for frame in container.decode(video=0))
+        seen = next(time for time, level in frames if level > 128)
+    with av.open(str(path)) as container:
+        for frame in container.decode(audio=0):
+            wave = frame.to_ndarray().astype(np.float64).ravel()
+            loud = np.nonzero(np.abs(wave / (32768 if frame.format.name.startswith("s16") else 1)) > 0.1)[0]
+            if len(loud):
+                return seen, float(frame.time) + int(loud[0]) / RATE
+    raise AssertionError("no tone")
+
+
+@pytest.mark.parametrize("ending", [".mp4", ".mkv"])
+@pytest.mark.parametrize(
+    ("name", "codec", "times", "begin"),
+    [
+        ("plain.mp4", "aac", EVEN, 0.0),
+        ("late.mkv", "aac", EVEN, 0.7),
+        ("varied.mp4", "aac", SLOWER, 0.0),
+        ("browser.webm", "libopus", EVEN, 0.0),
+        ("camera.mov", "pcm_s16le", EVEN, 0.0),
+    ],
+)
+def test_sound_goes_with_its_pictures(
+    name: str, codec: str, times: list[float], begin: float, ending: str, tmp_path: Path
+) -> None:
+    source = film(tmp_path / name, codec, times, begin)
+    kept = None if times is EVEN else torch.tensor(times, dtype=torch.float64)
+    pictures = torch.full((len(times), 3, 48, 64), 20, dtype=torch.uint8)
+    pictures[24:] = 250
+    out = tmp_path / f"out{ending}"
+    write_video([pictures], out, 30.0, kept, source)
+    assert sound_codec(out) == sound_codec(source)
+    assert sound_line(source, out) == []
+    seen, heard = events(out)
+    assert seen == pytest.approx(EVENT, abs=0.002)
+    assert heard == pytest.approx(seen, abs=0.005)
+    assert open_video(out).count == len(times)
+
+
+def test_frames_are_shown_at_their_own_times(tmp_path: Path) -> None:
+    times = torch.tensor(SLOWER, dtype=torch.float64)
+    for ending in (".mp4", ".mkv"):
+        out = write_video(torch.zeros(len(times), 48, 64), tmp_path / f"out{ending}", 20.0, times)
+        found, _ = open_video(out.path).uneven_seconds()
+        assert found is not None
+        torch.testing.assert_close(found, times, atol=0.001, rtol=0)
+    with pytest.raises(FileFormatError, match=r"out\.avi: \.avi holds frames at an even rate alone"):
+        write_video(torch.zeros(len(times), 48, 64), tmp_path / "out.avi", 20.0, times)
+
+
+def test_sound_that_a_file_cannot_hold_is_left_out_and_said(tmp_path: Path) -> None:
+    source = film(tmp_path / "browser.webm", "libopus", EVEN)
+    write_video(torch.zeros(45, 48, 64), tmp_path / "out.avi", 30.0, sound=source)
+    assert sound_codec(tmp_path / "out.avi") == ""
+    assert sound_line(source, tmp_path / "out.avi")[0].startswith("sound: .avi cannot hold browser.webm's (opus)")
