@@ -17,14 +17,14 @@ MISFIT = 0.045
 """Of the eyes' distance: landmarks that lie further from the fit are remarked on; those found in three photographs
 of people at most 2.4 % without the contour."""
 
-ONE_PERSON, OTHERS = 0.95, 0.25
-"""Probabilities: photographs above the first show one person, those whose heads' form has less than the second are
-refused.
+ONE_PERSON, DOUBTED, OTHERS = 0.95, 0.25, 0.05
+"""Probabilities by form and colours together: photographs above the first show one person, those below the last are
+refused where the form alone speaks against it too; the second is of the form, below which colours take no doubt away.
 
-Form and colours together, of pairs of found landmarks in 14 rendered people and 24 real ones: of 364 and 1,321 pairs
-of two people 13 and 12 % are above the first with the zoo's ``head`` (43 and 25 % by form alone), 2 and 13 % with ICT's
-modes (3 and 27 %); of 14 and 48 pairs of one, 4 and 24 are below it with ``head`` (6 and 25 by form alone), 3 and 1
-with ICT's (8 and 20). Those 48 are of three people.
+Of pairs of found landmarks in 14 rendered people and 24 real ones, 364 and 1,321 pairs of two people, 13 and 12 % pass
+without a word with the zoo's ``head`` (43 and 25 % by form alone), 2 and 13 % with ICT's modes (3 and 27 %); 31 and
+45 % are refused, 79 and 41 % with ICT's. Of 14 and 48 pairs of one person 0 and 6 are refused with ``head``, 4 and 24
+warned of or refused, with ICT's 0 and 0, 3 and 1. Those 48 are of three people.
 """
 
 FORM_SAYS = 4.0
@@ -97,15 +97,15 @@ def one_person_lines(
     colors: Tensor | None = None,
 ) -> list[str]:
     """Whether photographs that were fitted together show one person, for people to read; nothing if that is as
-    likely as expected. Each is fitted alone too; colours (I,4), see ``part_colors``, only lead to a warning."""
+    likely as expected. Each is fitted alone too; colours (I,4) are those of ``part_colors``."""
     if len(photographs) < 2:
         return []
     form = same_person(alone)
     sure = form.sigmoid()
     both = sure if colors is None else (form.clamp(max=FORM_SAYS) + color_evidence(colors)).sigmoid()
-    if float(both.min()) >= expected and float(sure.min()) >= OTHERS:
+    if float(both.min()) >= expected and float(sure.min()) >= DOUBTED:
         return []
-    worst = int(sure.argmin())
+    worst = int(both.argmin())
     joint = float(misfits(bare(marks, list(range(len(marks))))).square().mean().sqrt())
     each = float(torch.stack([misfits(fit)[0] for fit in alone]).square().mean().sqrt())
     listed, with_colors = (
@@ -118,7 +118,7 @@ def one_person_lines(
         f"above {expected:.0%}; landmarks lie {joint:.1%} of the eyes' distance from one head "
         f"for all, {each:.1%} from a head for each"
     )
-    if float(sure[worst]) < OTHERS and not insist:
+    if float(both[worst]) < OTHERS and float(form[worst]) < 0 and not insist:
         raise AlignmentError(
             f"{photographs[worst].name}: shows another person than the rest, or its landmarks are wrong ({figures}); "
             "leave it out, or --insist to fit them anyway"

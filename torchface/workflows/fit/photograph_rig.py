@@ -33,8 +33,8 @@ from torchface.viz.figures.landmark_dots import with_dots
 from torchface.workflows.fit.color_evidence import part_colors
 from torchface.workflows.fit.fit_checks import (
     ALONE,
+    DOUBTED,
     ONE_PERSON,
-    OTHERS,
     eyes_distances,
     landmark_lines,
     one_person_lines,
@@ -244,7 +244,7 @@ def fit_photographs(
     alone = [bare(marks[i : i + 1], [i]) for i in range(len(marks))]
     remarks += width_lines(photographs, alone, heads, rig.neutral.landmarks)
     # The tracker has followed one face through a film.
-    expected = OTHERS if one_film else ONE_PERSON
+    expected = DOUBTED if one_film else ONE_PERSON
     colors = None if one_film else torch.stack([part_colors(*one) for one in zip(images, parts, strict=True)])
     remarks += one_person_lines(photographs, marks, alone, bare, insist or one_film, expected, colors)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)
