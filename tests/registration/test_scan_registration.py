@@ -10,6 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchface.errors import AlignmentError
 from torchface.geometry.meshes.operators import triangle_cross
 from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.io import load_identity_modes, load_mesh, load_rig
@@ -17,7 +18,7 @@ from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.mesh import Mesh
 from torchface.registration import DEFAULT_SCHEDULE, Level, Registration, Schedule, Stage, register
 from torchface.registration.scan_preparation import Landmarks
-from torchface.synthetic import neutral_head
+from torchface.synthetic import draw_identities, neutral_head
 
 
 def error(result: Registration, truth: Tensor) -> Tensor:
@@ -332,6 +333,17 @@ def test_a_face_that_fits_nowhere_well_is_said_with_its_fit(mask: Mesh) -> None:
     rough = Mesh((mask.vertices + drawn).float(), mask.faces)
     found = register(mask, rough, schedule=Schedule(DEFAULT_SCHEDULE.stages[:1]))
     assert any("fits 0." in note and "give landmarks" in note for note in found.record.notes)
+
+
+def test_half_a_head_that_fits_at_no_heads_size_is_refused_without_landmarks() -> None:
+    """Of a half the template covered all, 1.4 times as large, and only remarks said so."""
+    somebody = neutral_head(draw_identities(4, torch.Generator().manual_seed(11))[3], texture=False)
+    regions = somebody.annotations.regions
+    inner = torch.stack([regions[name] for name in regions if name.startswith(("mouth_interior", "teeth", "eyeball"))])
+    shown = (somebody.vertices[:, 0] > -5) & ~inner.any(0)
+    half = Mesh(somebody.vertices, somebody.faces[shown[somebody.faces].all(1)])
+    with pytest.raises(AlignmentError, match=r"times its size, where it fits 0\.\d\d of 1; .* Give landmarks"):
+        register(neutral_head(texture=False), half, schedule=Schedule(DEFAULT_SCHEDULE.stages[:1]), texture_size=0)
 
 
 @pytest.mark.real

@@ -50,15 +50,21 @@ def start_on_scan(
     vertices, faces = template.vertices.detach().cpu().double(), template.faces.cpu()
     exposed = exposed_vertices(vertices, faces, schedule.opening).nonzero()[:, 0]
     samples = Samples.of(vertices, faces, evenly_spread(vertices, exposed, _RIGID_SAMPLES))
-    by, surface, notes = "landmarks", SurfaceIndex(prepared.vertices, prepared.faces), list[str]()
+    by, surface, notes, fit = "landmarks", SurfaceIndex(prepared.vertices, prepared.faces), list[str](), 1.0
     if landmarks is None:
         by = "shape"
-        pose, notes = _pose_by_shape(template, samples, ScanPoints.of(prepared.vertices, prepared.faces), exposed)
+        fit, pose, notes = _pose_by_shape(template, samples, ScanPoints.of(prepared.vertices, prepared.faces), exposed)
         if detector is not None:
             aligned = template.with_vertices(pose.apply(vertices)[0].to(template.vertices))
             landmarks = detector(aligned, scan, pose)
             by = "detected landmarks" if landmarks is not None else by
     if landmarks is None:
+        if fit < _SURE_FIT and scale_notes(pose):
+            raise AlignmentError(
+                f"register: by its shape alone the template fits the scan best at {float(pose.scale[0]):.3g} times its "
+                f"size, where it fits {fit:.2f} of 1; expected {MIN_HEAD_SCALE} to {MAX_HEAD_SCALE} times, as heads "
+                f"differ, or a fit of {_SURE_FIT}: is it half a head, or another unit? Give landmarks"
+            )
         return StartOnScan(by, pose, LandmarkPull.none(), prepared, surface, (*prepared.notes, *notes))
     (ids, points), pose, note = check_landmarks(landmarks, template, surface)
     notes = [note] if note else []
@@ -70,8 +76,10 @@ def start_on_scan(
     return StartOnScan(by, pose, LandmarkPull.of(ids, points, template), prepared, surface, (*prepared.notes, *notes))
 
 
-def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: Tensor) -> tuple[Similarity, list[str]]:
-    """The pose in which the face fits best, and a note where that is not well.
+def _pose_by_shape(
+    template: Mesh, samples: Samples, scan: ScanPoints, exposed: Tensor
+) -> tuple[float, Similarity, list[str]]:
+    """How well the face fits, the pose in which it fits best, and a note where that is not well.
 
     By the whole template, or by its face alone where the rest (shoulders, another hairdo) is not on the scan; larger
     and smaller where it fits in neither way.
@@ -88,12 +96,13 @@ def _pose_by_shape(template: Mesh, samples: Samples, scan: ScanPoints, exposed: 
             f"register: the template lies nowhere on the scan by its shape alone: {error}; give landmarks"
         ) from error
     if best >= _SURE_FIT:
-        return pose, _other_heads(samples, face, scan, pose)
-    return pose, [
+        return best, pose, _other_heads(samples, face, scan, pose)
+    note = (
         f"the face was found by its shape alone and fits {best:.2f} of 1 there, where heads fit {_SURE_FIT} and more: "
         "look at the registered mesh (torchface register writes NAME.glb and contact_sheet.png), and give landmarks if "
         "it lies elsewhere"
-    ]
+    )
+    return best, pose, [note]
 
 
 def _best_pose(samples: Samples, face: Samples, scan: ScanPoints, sizes: Sequence[float]) -> tuple[float, Similarity]:

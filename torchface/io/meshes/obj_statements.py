@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from torchface.errors import FileFormatError, TopologyError
 from torchface.files.line_pieces import line_pieces
+from torchface.io.meshes.polygons import MESHING
 
 _VERTEX_WIDTHS = (3, 4, 6, 7)
 _MAX_LIBRARIES = 64
@@ -54,7 +55,9 @@ def read_statements(path: Path, data: bytes) -> Statements:
         raise FileFormatError(f"{path}: found no vertex (line 'v x y z'), expected an OBJ mesh")
     sizes = np.concatenate([piece.sizes for piece in faces])
     if not len(sizes):
-        raise FileFormatError(f"{path}: found {len(table)} vertices and no face (line 'f'), expected at least one face")
+        raise FileFormatError(
+            f"{path}: found {len(table)} vertices and no face (line 'f'), expected at least one face; {MESHING}"
+        )
     if sizes.min() < 3:
         raise FileFormatError(
             f"{path}: found {int(sizes.min())} corners in face {int(sizes.argmin())}, expected at least 3"

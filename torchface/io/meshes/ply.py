@@ -10,7 +10,7 @@ from torchface.errors import FileFormatError, TopologyError
 from torchface.files.whole_files import read_file, write_file
 from torchface.io.length_units import finite_vertices, millimetres_per
 from torchface.io.meshes.ply_tables import Element, Lists, read_tables
-from torchface.io.meshes.polygons import corners_of_polygons, pad_polygons
+from torchface.io.meshes.polygons import MESHING, corners_of_polygons, pad_polygons
 from torchface.mesh import Mesh, fan_triangulation
 
 _FACE_LISTS = ("vertex_indices", "vertex_index")
@@ -27,7 +27,9 @@ def read_ply(path: str | Path, unit: str = "mm") -> Mesh:
     vertices = finite_vertices(path, np.stack([columns[axis] for axis in "xyz"], axis=1) * scale)
     lists = next((rows for name in _FACE_LISTS if isinstance(rows := tables.get("face", {}).get(name), Lists)), None)
     if lists is None or len(lists.sizes) == 0:
-        raise FileFormatError(f"{path}: found {len(vertices)} vertices and no face, expected at least one face")
+        raise FileFormatError(
+            f"{path}: found {len(vertices)} vertices and no face, expected at least one face; {MESHING}"
+        )
     if lists.sizes.min() < 3:
         raise FileFormatError(f"{path}: found a face of {int(lists.sizes.min())} corners, expected at least 3")
     corners = lists.values

@@ -8,6 +8,11 @@ from torch import Tensor
 from torchface.errors import FileFormatError
 from torchface.mesh import Mesh
 
+MESHING = (
+    "MeshLab makes a mesh of points: Compute normals for point sets, then Surface Reconstruction: Screened Poisson"
+)
+"""What to do with a file of points without faces."""
+
 _MAX_TABLE = 20_000_000
 
 
