@@ -195,6 +195,21 @@ def test_offsets_of_another_person_are_said(done: Done, filmed: Filmed, tmp_path
     assert known_offsets(inputs, out) is None  # it holds those of another video now
 
 
+def test_after_a_face_its_expression_stays_and_goes_to_rest_as_the_report_says(filmed: Filmed, tmp_path: Path) -> None:
+    frames = torch.stack(list(open_video(filmed.video).color_frames()))
+    write_video([frames, torch.full((45, *frames.shape[1:]), 90, dtype=torch.uint8)], tmp_path / "gone.avi", 30.0)
+    tracked = track_video(tmp_path / "gone.avi", filmed.rig, tmp_path / "out", QUICK)
+    said = "the expression stays for a third of a second and is at rest a second later"
+    assert any(line.startswith("45 frames without a face") and said in line for line in tracked.lines())
+    jaw = tracked.solution.weights[:, filmed.actor.names.index("jawOpen")]
+    assert jaw[FRAMES - 1] > 0.5
+    assert (jaw[FRAMES : FRAMES + 9] > 0.9 * jaw[FRAMES - 1]).all()
+    assert jaw[FRAMES + 40] < 0.05 * jaw[FRAMES - 1]
+    rows = [line.split(",") for line in (tmp_path / "out" / "landmarks.csv").read_text().splitlines()]
+    lost = [int(row[0]) for row in rows[1:] if row[rows[0].index("success")] == "0"]
+    assert lost == list(range(FRAMES + 1, FRAMES + 46))  # from 1
+
+
 def test_a_cut_to_another_face_is_said_and_not_solved(filmed: Filmed, tmp_path: Path) -> None:
     """The other one has a longer face of another colour, under another light."""
     frames = torch.stack(list(open_video(filmed.video).color_frames()))

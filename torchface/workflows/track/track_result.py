@@ -31,6 +31,7 @@ _SURE, _MOST = 0.5, 0.9
 _AT_BOUND, _OFTEN, _MAX_NAMED = 1e-3, 0.2, 5
 _LEAST_MOTION = 1e-2  # mm²
 _OWN_EYES = 2.0  # degrees
+_FROM_ONE = "its frames count from 1, those here and in weights.csv from 0"
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +127,7 @@ class Tracked:
         frames = int(self.outliers.any(1).sum())
         return [
             f"{len(places)} landmarks in {frames} frames lie where no face has them and were left out: {named}{more} "
-            "(landmarks.csv gives them a confidence of 0)"
+            f"(landmarks.csv gives them a confidence of 0; {_FROM_ONE})"
         ]
 
     def suspect_spans(self) -> list[tuple[int, int, str]]:
@@ -240,8 +241,9 @@ class Tracked:
         lost = count - seen
         if lost:
             lines.append(
-                f"{lost} frames without a face: they keep the face before, the first ones that of the first face, or "
-                "with --whole-take lie between those before and after; landmarks.csv says which (success 0)"
+                f"{lost} frames without a face: the head stays where it was; the expression stays for a third of a "
+                "second and is at rest a second later, or with --whole-take lies between those before and after; "
+                f"landmarks.csv says which (success 0; {_FROM_ONE})"
             )
         bounds = self.bounds()
         dark = self.hidden_share()
