@@ -75,6 +75,12 @@ def test_lossy_colours_are_near(tmp_path: Path) -> None:
     assert (read - frame).abs().mean() < 0.01
 
 
+def test_a_coarser_film_is_smaller(tmp_path: Path) -> None:
+    noise = torch.randint(0, 256, (8, 3, 64, 64), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    sizes = [write_video([noise], tmp_path / f"{crf}.mp4", 30.0, crf=crf).path.stat().st_size for crf in (16, 28)]
+    assert sizes[1] < 0.6 * sizes[0]
+
+
 def test_a_broken_video_is_refused(frames: torch.Tensor, tmp_path: Path) -> None:
     path = tmp_path / "whole.avi"
     write_video([frames], path, 60.0)

@@ -75,7 +75,11 @@ def test_damaged_files_are_told_and_made_anew(
     for name in ("weights.csv", "animation.glb", "summary.json"):
         (out / name).write_bytes(b"")
     settings = TrackSettings(camera=filmed.camera)
-    killed(lambda told: track_video(filmed.video, filmed.rig, out, settings, told), "drawing the overlay", 5)
+    killed(
+        lambda told: track_video(filmed.video, filmed.rig, out, settings, told),
+        "drawing the overlay (--overlay none skips it)",
+        5,
+    )
     left = out / FOLDER / f".{pieces[1].name}.999999.part"
     left.write_bytes(b"of a run that was killed")
     with pytest.warns(UserWarning, match="overlay.mp4: found other content than was written"):

@@ -169,6 +169,8 @@ def test_the_verdict_comes_first(done: Done) -> None:
     eyes = (tracked.landmarks[:, 36] - tracked.landmarks[:, 45]).norm(dim=1).median()
     shifted = replace(tracked.solution, errors=tracked.solution.errors + 0.05 * eyes)
     assert replace(tracked, solution=shifted).verdict().startswith("result: poor, the solved face lies ")
+    long = replace(tracked, seconds={"landmarks": 90.0, "weights": 40.0, "overlay": 370.0})
+    assert long.lines()[-1] == "the overlay took 74% of it; --overlay none skips it"
     marks = tracked.reading.landmarks.clone()
     marks[: FRAMES // 2] = torch.nan
     half = replace(tracked, reading=replace(tracked.reading, landmarks=marks))

@@ -132,13 +132,13 @@ class DrawnPixels:
     triangle: Tensor  # in front there, (S,) int64
     nearness: Tensor  # as the corners', interpolated, (S,) float32
     planes: "_Planes"
-    at: tuple[np.ndarray, np.ndarray, np.ndarray]  # row and column of each pixel, and which of the planes it is of
+    # Row and column of each pixel, float32, and which of the planes it is of.
+    at: tuple[np.ndarray, np.ndarray, np.ndarray]
 
     def interpolated(self, values: Tensor) -> Tensor:
-        """Values (F,3) of triangles' corners at the pixels, (S,) float64, linear in the image."""
-        row, column, plane = self.at
-        across, down, rest = self.planes.linear(values.numpy()[self.planes.triangle].T)
-        return torch.from_numpy(across[plane] * column + down[plane] * row + rest[plane])
+        """Values (F,3) of triangles' corners at the pixels, (S,) float32, linear in the image."""
+        corners = values.numpy()[self.planes.triangle].T
+        return torch.from_numpy(_at_pixels(self.planes.linear(corners), *self.at))
 
 
 def rasterise(points: Tensor, nearness: Tensor, faces: Tensor, height: int, width: int) -> DrawnPixels:
@@ -160,22 +160,36 @@ def rasterise(points: Tensor, nearness: Tensor, faces: Tensor, height: int, widt
     triangles = faces.cpu().numpy()
     # Rows count downward: what is counter-clockwise on the mesh is clockwise here.
     planes = _Planes.of(xy, triangles, height, width, _SLACK, _LEAST_AREA, facing=True)
-    across, down, rest = planes.linear(near[triangles[planes.triangle].T])
     row, column, plane = next(planes.samples(width, _SLACK, None))
-    value = (across[plane] * column + (down[plane] * row + rest[plane])).astype(np.float32)
-    pixel = row * width + column
+    places = row.astype(np.float32), column.astype(np.float32)
+    value = _at_pixels(planes.linear(near[triangles[planes.triangle].T]), *places, plane)
+    row *= width
+    row += column
+    pixel = row
     kept = _nearest(pixel, value, height * width)
-    at = row[kept], column[kept], plane[kept]
-    parts = (pixel[kept], planes.triangle[at[2]], value[kept])
+    at = places[0].take(kept), places[1].take(kept), plane.take(kept)
+    parts = (pixel.take(kept), planes.triangle.take(at[2]), value.take(kept))
     covered, triangle, closeness = (torch.from_numpy(part) for part in parts)
     return DrawnPixels(covered, triangle, closeness, planes, at)
+
+
+def _at_pixels(planes: np.ndarray, row: np.ndarray, column: np.ndarray, plane: np.ndarray) -> np.ndarray:
+    """Linear functions (3,P) at rows and columns (S,), each that of its number ``plane`` (S,); float32, for speed."""
+    across, down, rest = planes.astype(np.float32)
+    value = down.take(plane)
+    value *= row
+    value += rest.take(plane)
+    other = across.take(plane)
+    other *= column
+    value += other
+    return value
 
 
 def _nearest(pixel: np.ndarray, nearness: np.ndarray, count: int) -> np.ndarray:
     """Which samples are the nearest of their pixel, one a pixel."""
     best = np.full(count, -np.inf, np.float32)
     np.maximum.at(best, pixel, nearness)
-    winners = np.flatnonzero(nearness >= best[pixel])
+    winners = np.flatnonzero(nearness >= best.take(pixel))
     chosen = np.full(count, -1)
     chosen[pixel[winners]] = winners  # of samples that are equally near, one
     return chosen[chosen >= 0]
@@ -238,8 +252,10 @@ class _Planes:
         for a, b, c in self.edges:  # the three borders of every row
             level = np.abs(a) < _LEVEL  # such an edge bounds no row
             inverse = -1 / np.where(level, 1, a)
-            crossing = (b * inverse)[plane] * row + (c * inverse)[plane]
-            begins, ends = (a >= _LEVEL)[plane], (a <= -_LEVEL)[plane]
+            crossing = (b * inverse).take(plane)  # take, and in place: half the time of brackets
+            crossing *= row
+            crossing += (c * inverse).take(plane)
+            begins, ends = (a >= _LEVEL).take(plane), (a <= -_LEVEL).take(plane)
             np.maximum(left, crossing, out=left, where=begins)
             np.minimum(right, crossing, out=right, where=ends)
         begin = np.ceil(left - slack).clip(0, width).astype(np.int64)
@@ -251,11 +267,12 @@ class _Planes:
         for start, stop in reversed(list(pairwise(cuts))):
             piece = slice(start, stop)
             span, column = _expanded(count[piece], begin[piece])
-            yield row[piece][span], column, plane[piece][span]
+            yield row[piece].take(span), column, plane[piece].take(span)
 
 
 def _expanded(counts: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """For each of some runs of ``counts`` whole numbers: which run, and the numbers from its first on."""
     run = np.repeat(np.arange(len(counts)), counts)
-    shift = first - (np.cumsum(counts) - counts)
-    return run, np.arange(len(run)) + shift[run]
+    numbers = (first - (np.cumsum(counts) - counts)).take(run)
+    numbers += np.arange(len(run))
+    return run, numbers

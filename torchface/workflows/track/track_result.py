@@ -31,6 +31,7 @@ _SURE, _MOST = 0.5, 0.9
 _AT_BOUND, _OFTEN, _MAX_NAMED = 1e-3, 0.2, 5
 _LEAST_MOTION = 1e-2  # mm²
 _OWN_EYES = 2.0  # degrees
+_MOST_OF_TIME = 0.4
 _FROM_ONE = "its frames count from 1, those here and in weights.csv from 0"
 
 
@@ -286,4 +287,8 @@ class Tracked:
         if self.seconds:
             took = ", ".join(f"{name} {seconds:.1f} s" for name, seconds in self.seconds.items())
             lines.append(f"time, start included: {took}; the film lasts {count / self.video.fps:.1f} s")
+            if (overlay := self.seconds.get("overlay", 0.0)) > _MOST_OF_TIME * sum(self.seconds.values()):
+                lines.append(
+                    f"the overlay took {overlay / sum(self.seconds.values()):.0%} of it; --overlay none skips it"
+                )
         return lines
