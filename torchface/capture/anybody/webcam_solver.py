@@ -27,11 +27,10 @@ from torchface.capture.own_rig.weight_walk import (
 from torchface.capture.weight_readings import doubted_blinks
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
-from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading, trust_of
+from torchface.landmarks.images.face_reading import LEAST_VISIBLE, READ_FOR_SOLVER, FaceReading, trust_of
 from torchface.optim.exported_operators import symmetric_inverse
 
 _SPLITTING_STEPS = 30
-_ENOUGH = 20.0  # landmarks
 _LEAST_TRUST = 8.0  # of landmarks that nothing hides, together
 _PRESENT = 0.5
 _NEAR = 0.5  # of the eyes' distance
@@ -152,7 +151,7 @@ class WebcamSolver(WebcamSolverParts):
         centre = 0.5 * (size.double() - 1)
         rays, iris_rays = (landmarks.double() - centre) / focal, (iris.double() - centre) / focal
         visible = ~torch.isnan(rays).any(1)
-        present = _known(presence.double(), 0.0) * (visible.double().sum() >= _ENOUGH)
+        present = _known(presence.double(), 0.0) * (visible.double().sum() >= LEAST_VISIBLE)
         trust = trust_of(self.landmark_weights * visible, _known(visibility.double(), 1.0).clamp(0, 1))
         shows_face = (present > _PRESENT) & (trust.sum() > _LEAST_TRUST)
         # Without a face all counts alike and what comes of it is dropped, so that no number is a NaN.

@@ -17,6 +17,9 @@ READ_FOR_SOLVER = (
 )  # fmt: skip
 """The parts of a reading that a webcam's solver takes, in its order."""
 
+LEAST_VISIBLE = 20.0
+"""Visible landmarks that a face has at least which a webcam's reader finds and its solver solves."""
+
 HALF_CONFIDENCE = 0.02  # the deviation, in sides of the face's box, of a confidence of one half
 
 _HIDDEN, _VISIBLE = 0.7, 0.95

@@ -142,6 +142,23 @@ def test_it_stays_with_the_largest_and_finds_it_again(webcam: Webcam, portrait: 
     assert column(webcam.step(both(small, head))) > 190  # forgotten: the largest
 
 
+def test_a_face_with_too_few_visible_landmarks_to_be_solved_is_none(
+    webcam: Webcam, portrait: tuple[Tensor, Tensor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """However sure the network is that it is there: an application would move a head that nobody solved."""
+    look = webcam.reader.look
+
+    def blind(image: Tensor, place: Tensor) -> Tensor:
+        seen = look(image, place).clone()
+        seen[3 * 68 : 4 * 68] = 0.2
+        return seen
+
+    assert webcam.step(scene(portrait[0], (60, 50))).presence > 0.9
+    webcam.state = torch.zeros(STATE)
+    monkeypatch.setattr(webcam.reader, "look", blind)
+    assert webcam.step(scene(portrait[0], (60, 50))).presence == 0
+
+
 @pytest.mark.parametrize(("grey", "frames"), [(60, 3), (110, 3), (0, 12)])
 def test_a_plain_wall_is_no_face_for_long(
     webcam: Webcam, portrait: tuple[Tensor, Tensor], grey: int, frames: int

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.landmarks.images.boxes.box_network import INPUT_SIZE, BoxNetwork
-from torchface.landmarks.images.face_reading import FaceReading, confidence_of
+from torchface.landmarks.images.face_reading import LEAST_VISIBLE, FaceReading, confidence_of
 from torchface.landmarks.images.folded_normalisation import without_normalisation
 from torchface.landmarks.images.frame_reader.face_place import overlap, place_around, plausible, relation, sought
 from torchface.landmarks.images.frame_reader.face_search import FOUND, search
@@ -170,7 +170,8 @@ class FaceReader(nn.Module):
         vague = confidence_of(deviation / own[2].clamp(min=1)).mean() < settings.vague
         kept = ((presence >= settings.likely) & ~vague) | ~asked | confirmed
         kept = kept & (presence >= settings.least) & (growth > _SHRUNK) & (growth < _GROWN)
-        good = (followed & kept) | (~followed & ~vague & (presence >= settings.new))
+        seen_well = looked.visibility.sum() >= LEAST_VISIBLE
+        good = (followed & kept) | (~followed & ~vague & seen_well & (presence >= settings.new))
         good = good & ready & ~stranger & plausible(own, size, settings.smallest)
         empty = looked.visibility.mean() < _EMPTY
         clear = ((presence >= settings.sure) & ~vague) | confirmed
