@@ -67,7 +67,7 @@ def evaluate(
         rig: The rig that the result's weights move, or whose topology its meshes have.
         truth_rig: The rig that the truth's weights move; --rig if absent.
         part: Keep this region only, such as face.
-        frames: Which of the result's frames, from 0, the truth's are, in order; all if absent.
+        frames: Which of the result's frames, from 0, the truth's are, in order; those of the truth's times if absent.
         by_number: Compare the first frame with the first, and so on, whatever their times say.
         benchmark: RESULT and TRUTH are folders of films' weights.
         align: Turn and move each frame of the result to where it is nearest to the truth.
@@ -103,7 +103,7 @@ def evaluate(
     regions.sort(key=lambda region: -region[1].mean)
     for name, figures in (whole, *regions[:_SHOWN]):
         numbers = (figures.mean, figures.median, figures.percentile_95, figures.largest)
-        table.add_row(name, *(f"{x:.3f}" for x in numbers), f"{figures.total:.4e}", str(figures.vertices))
+        table.add_row(name, *(f"{x:.3f}" for x in numbers), f"{figures.total:.3f}", str(figures.vertices))
     if len(regions) > _SHOWN:
         table.caption = f"the {_SHOWN} regions that are farthest off; regions.csv has all {len(regions)}"
     console.print(table)

@@ -2,6 +2,7 @@
 
 import csv
 import json
+import re
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
@@ -99,6 +100,7 @@ def test_weights_are_compared_by_shape_and_the_report_shows_it_all(
     told = capsys.readouterr()
     assert told.out.strip() == str(folder / "out" / "index.html")
     assert "over 4 shapes" in told.err
+    assert not re.search(r"\de[+-]\d", told.err)
     assert "regions.csv has all" in " ".join(told.err.split())
     assert "upper" not in told.err.partition("frames compared")[0]
     rows = {row["shape"]: row for row in csv.DictReader((folder / "out" / "shapes.csv").open())}
@@ -204,3 +206,43 @@ def test_frames_of_a_variable_rate_are_compared_at_their_times(folder: Path) -> 
     assert evaluate(folder / "uneven.csv", folder / "uneven.glb", folder / "out", settings).regions[ALL].largest < 1e-4
     with pytest.raises(ValueRangeError, match=r"s from the nearest; .*--by-number"):
         evaluate(folder / "even.csv", folder / "uneven.csv", folder / "out", settings)
+
+
+def test_takes_of_other_rates_are_compared_at_the_times_of_the_result(folder: Path, rig: BlendshapeRig) -> None:
+    slopes = torch.tensor([0.3, 0.2, 0.1, 0.25])
+    slow, fast = (torch.arange(count)[:, None] / rate * slopes for count, rate in ((24, 24.0), (60, 60.0)))  # a second
+    for name, values, rate in (("slow", slow, 24.0), ("fast", fast, 60.0)):
+        save_weights_csv(Take(rate, weights=Track(NAMES, values[..., None])), folder / f"{name}.csv")
+    every_second = Take(60.0, weights=Track(NAMES, fast[..., None])).rows(torch.arange(0, 60, 2))
+    save_weights_csv(every_second, folder / "half.csv")
+    with MeshSequenceWriter(folder / "slow.safetensors", 24, 625, rig.neutral.faces, fps=24.0) as writer:
+        writer.append(rig(slow))
+    settings = EvaluationSettings(rig=folder / "rig.glb")
+
+    def compared(result: str, truth: str) -> tuple[list[int], str]:
+        found = evaluate(folder / result, folder / truth, folder / "out", settings)
+        assert found.regions[ALL].largest < 1e-3
+        assert found.shapes is None or float(found.shapes.error.largest.max()) < 1e-5
+        return found.frames.tolist(), " ".join(found.notes)
+
+    frames, note = compared("half.csv", "fast.csv")
+    assert frames == list(range(30))
+    assert "30 frames at the same times" in note
+    assert compared("fast.csv", "half.csv")[0] == list(range(0, 60, 2))
+    for slower in ("slow.csv", "slow.safetensors"):
+        frames, note = compared(slower, "fast.csv")
+        assert frames == list(range(24))
+        assert "24 of the result's 24 frames were compared, each with the truth at its time" in note
+    frames, note = compared("fast.csv", "slow.csv")
+    assert len(frames) == 23  # the frame nearest to the last lies behind it
+    assert all(abs(frame / 60 - row / 24) < 1 / 100 for row, frame in enumerate(frames))
+    assert "23 of the result's 60 frames" in note
+
+
+def test_takes_of_other_rates_at_other_times_are_refused(folder: Path) -> None:
+    settings = EvaluationSettings(rig=folder / "rig.glb")
+    many = Take(60.0, weights=Track(NAMES, torch.rand(180, 4, 1)))
+    save_weights_csv(many.frames(slice(0, 40)), folder / "first.csv")
+    save_weights_csv(many.rows(torch.arange(100, 180, 2)[:30]), folder / "later.csv")
+    with pytest.raises(ValueRangeError, match=r"found 40 frames from 0.000 to 0.650 s, .* 1.667 to .* 0 have one"):
+        evaluate(folder / "first.csv", folder / "later.csv", folder / "out", settings)

@@ -19,6 +19,7 @@ from torchface.files.whole_files import all_or_none
 from torchface.mesh import Annotations, Mesh
 from torchface.progress import Progress, silent
 from torchface.shape_names import mapping
+from torchface.temporal.interpolation import frames_beside, values_at
 from torchface.viz.figures.error_maps import round_maximum
 from torchface.workflows.animated_meshes import AnimatedMesh, load_animated
 from torchface.workflows.evaluate.evaluation_record import ALL, Compared, Evaluation, write_tables
@@ -124,34 +125,62 @@ def compare(found: AnimatedMesh, true: AnimatedMesh, settings: EvaluationSetting
 
 
 def _pairs(found: AnimatedMesh, true: AnimatedMesh, settings: EvaluationSettings) -> tuple[Tensor, Tensor, list[str]]:
-    """Frames of the result and of the truth that are compared, (K,) each, and what is to be said of them."""
-    if settings.frames is not None or settings.by_number or found.take is None or true.take is None:
-        frames = _frames(found, true, settings.frames)
-        return frames, torch.arange(len(frames)), _rate_notes(found, true)
-    a, b = found.take, true.take
+    """Frames of the result that are compared, (K,) int64, and where the truth is at their times, frames (K,) float64.
+
+    With them what is to be said of them. 2.5 is halfway between frames 2 and 3.
+    """
+    timed = found.take is not None and true.take is not None
+    by_number = settings.frames is not None or settings.by_number or (found.count == true.count and not timed)
+    if by_number or found.fps is None or true.fps is None:
+        return _by_number(found, true, settings.frames)
     numbered = found.numbered and true.numbered
-    here, there = (take.clock if numbered else take.times for take in (a, b))
-    shifted = abs(float(here[0] - there[0])) * a.fps > _SAME_FRAME
-    if not shifted and (found.count != true.count or (a.seconds is None and b.seconds is None)):
-        frames = _frames(found, true, None)
-        return frames, torch.arange(len(frames)), _rate_notes(found, true)
+    here, there = _times(found, numbered), _times(true, numbered)
+    fastest = max(found.fps, true.fps)
+    even = all(one.take is None or one.take.seconds is None for one in (found, true))
+    alike = even and not _rate_notes(found, true)  # then it is not known which frames of the longer the shorter has
+    if abs(float(here[0] - there[0])) * found.fps <= _SAME_FRAME and even and (found.count == true.count or alike):
+        return _by_number(found, true, None)
     nearest = torch.searchsorted((here[1:] + here[:-1]) / 2, there)
-    same = (here[nearest] - there).abs() * max(a.fps, b.fps) <= _SAME_FRAME
-    rows, true_rows = nearest[same], same.nonzero()[:, 0]
+    same = (here[nearest] - there).abs() * fastest <= _SAME_FRAME
+    rows, true_rows = nearest[same], same.nonzero()[:, 0].double()
     spans = [f"{float(times[0]):.3f} to {float(times[-1]):.3f} s" for times in (here, there)]
-    if len(rows) < min(found.count, true.count):
-        worst = int((here[nearest] - there).abs().argmax())
-        raise ValueRangeError(
-            f"{found.path}: found {found.count} frames from {spans[0]}, expected the times of the {true.count} of "
-            f"{true.path}, {spans[1]}: {len(rows)} have one, and frame {worst} of the truth is "
-            f"{float((here[nearest] - there)[worst].abs()):.3f} s from the nearest; or say which frames of the result "
-            "they are (--frames), or compare the first with the first (--by-number)"
-        )
     if len(rows) == found.count == true.count:
         return rows, true_rows, []
-    spans = [f"{int(numbers[0])} to {int(numbers[-1])}" for numbers in (rows, true_rows)]
-    note = f"{len(rows)} frames at the same times were compared, {spans[0]} of the result with {spans[1]} of the truth"
-    return rows, true_rows, [note]
+    if len(rows) == min(found.count, true.count):
+        spans = [f"{int(numbers[0])} to {int(numbers[-1])}" for numbers in (rows, true_rows)]
+        note = f"{len(rows)} frames at the same times were compared, {spans[0]} of the result with {spans[1]}"
+        return rows, true_rows, [f"{note} of the truth"]
+    if not alike and found.count != true.count:
+        rows = torch.arange(found.count) if found.count < true.count else nearest.unique()
+        inside = (here[rows] >= there[0] - _SAME_FRAME / fastest) & (here[rows] <= there[-1] + _SAME_FRAME / fastest)
+        before, fraction = frames_beside(there, here[rows])
+        true_rows = before + fraction
+        beside = (there[true_rows.round().long()] - here[rows]).abs() * true.fps <= 1
+        rows, true_rows = rows[inside & beside], true_rows[inside & beside]
+        if len(rows):
+            note = f"{len(rows)} of the result's {found.count} frames were compared, each with the truth at its time"
+            return rows, true_rows, [f"{note}, linear between the truth's {true.count} frames"]
+    worst = int((here[nearest] - there).abs().argmax())
+    raise ValueRangeError(
+        f"{found.path}: found {found.count} frames from {spans[0]}, expected the times of the {true.count} of "
+        f"{true.path}, {spans[1]}: {int(same.sum())} have one, and frame {worst} of the truth is "
+        f"{float((here[nearest] - there)[worst].abs()):.3f} s from the nearest; or say which frames of the result "
+        "they are (--frames), or compare the first with the first (--by-number)"
+    )
+
+
+def _by_number(
+    found: AnimatedMesh, true: AnimatedMesh, chosen: tuple[int, ...] | None
+) -> tuple[Tensor, Tensor, list[str]]:
+    frames = _frames(found, true, chosen)
+    return frames, torch.arange(len(frames), dtype=torch.float64), _rate_notes(found, true)
+
+
+def _times(animated: AnimatedMesh, numbered: bool) -> Tensor:
+    """When each frame is shown (T,), seconds since the recording began where frames are numbered, else the first."""
+    if animated.take is None:
+        return torch.arange(animated.count, dtype=torch.float64) / (animated.fps or 1.0)
+    return animated.take.clock if numbered else animated.take.times
 
 
 def _rate_notes(found: AnimatedMesh, true: AnimatedMesh) -> list[str]:
@@ -182,7 +211,7 @@ def _pair(
 ) -> tuple[Tensor, Tensor, tuple[Tensor, Tensor] | None]:
     """Vertices (t,V,3) of the result's frames and of the truth's, and the rotation and translation of the former."""
     a = _read(found, rows)
-    b = _read(true, true_rows).to(a)
+    b = _read_between(true, true_rows).to(a)
     if not aligned:
         return a, b, None
     usable = (torch.isfinite(a) & torch.isfinite(b)).all(2).sum(1) >= 3
@@ -199,6 +228,15 @@ def _read(animated: AnimatedMesh, rows: Tensor) -> Tensor:
     first, last = int(rows.min()), int(rows.max()) + 1
     together = last - first == len(rows) and bool((rows == torch.arange(first, last)).all())
     return animated.read(first, last) if together else torch.cat([animated.read(r, r + 1) for r in rows.tolist()])
+
+
+def _read_between(animated: AnimatedMesh, rows: Tensor) -> Tensor:
+    """Vertices (K,V,3) at frames (K,) float64, linear between two frames."""
+    before = rows.floor()
+    here = _read(animated, before.long())
+    if torch.equal(before, rows):
+        return here
+    return torch.lerp(here, _read(animated, rows.ceil().long()), (rows - before).to(here)[:, None, None])
 
 
 def _shown(
@@ -219,7 +257,8 @@ def _shown(
 def _shapes(found: AnimatedMesh, true: AnimatedMesh, frames: Tensor, true_rows: Tensor) -> ShapeErrors | None:
     if found.weights is None or true.weights is None or not mapping(found.weights.names, true.weights.names).any():
         return None
-    solved, actual = found.weights.values[frames, :, 0], true.weights.values[true_rows, :, 0]
+    solved = found.weights.values[frames, :, 0]
+    actual = values_at(true.weights.values[..., 0], torch.arange(true.count), true_rows)
     return shape_errors(solved, found.weights.names, actual, true.weights.names)
 
 

@@ -19,7 +19,7 @@ def write_evaluation_page(evaluation: Evaluation, out: Path, height: int = 290) 
     sections = [Section("What was compared", "; ".join(evaluation.lines()))]
     heading = ("region", "mean", "median", "95 %", "largest", "total", "vertices")
     rows = [
-        (name, *(f"{value:.3f}" for value in figures[:4]), f"{figures[4]:.4e}", str(figures[5]))
+        (name, *(f"{value:.3f}" for value in figures[:5]), str(figures[5]))
         for name, figures in ((name, tuple(asdict(found).values())) for name, found in evaluation.regions.items())
     ]
     text = "Distances from vertex to true vertex, millimetres; the total is the sum over a frame's vertices."
@@ -68,7 +68,7 @@ def _one_frame(evaluation: Evaluation, shown: Compared, height: int) -> Tensor:
     # Where the truth has no vertex the result's stands in, so that the figure has a whole face; it is grey below.
     vertices = torch.where(torch.isfinite(shown.found), shown.found, evaluation.mesh.vertices)
     true = torch.where(known, shown.true, vertices)
-    title = f"frame {shown.frame}: mean {mean:.2f} mm, total {float(shown.errors.nansum()):.4e} mm"
+    title = f"frame {shown.frame}: mean {mean:.2f} mm, total {float(shown.errors.nansum()):.2f} mm"
     own = evaluation.mesh
     return compared_views(
         own.with_vertices(vertices), own.with_vertices(true), shown.errors, evaluation.maximum, title, height

@@ -67,7 +67,7 @@ class Evaluation:
                 errors = self.regions[name]
                 lines.append(
                     f"{name}: mean {errors.mean:.3f} mm, median {errors.median:.3f}, 95th percentile "
-                    f"{errors.percentile_95:.3f}, largest {errors.largest:.3f}; total {errors.total:.4e} mm a frame"
+                    f"{errors.percentile_95:.3f}, largest {errors.largest:.3f}; total {errors.total:.3f} mm a frame"
                 )
         if self.shapes is not None:
             error = self.shapes.error
