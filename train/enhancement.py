@@ -19,8 +19,8 @@ from torchface.enhancement import CapturedPerformance, EnhancementModel, Enhance
 from torchface.enhancement.detail.low_pass import WAVELENGTH
 from torchface.errors import ValueRangeError
 from torchface.io import MeshSequence
+from torchface.workflows.animated_meshes import DEFAULT_FPS
 from torchface.workflows.enhance.coarse_animation import (
-    DEFAULT_FPS,
     OWN_HEAD_MM,
     SAMPLED,
     distance_at_rest,

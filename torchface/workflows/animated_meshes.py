@@ -30,6 +30,8 @@ from torchface.workflows.weight_files import check_whole_frames
 
 _FORMS = "weights as .csv, an animated .glb or .usdc, a mesh sequence as .safetensors, a mesh, or a folder of meshes"
 
+DEFAULT_FPS = 30.0
+_SAME_RATE = 2e-3  # relative; 29.97 and 30 are the same
 _KEPT = 8  # meshes
 
 
@@ -110,6 +112,20 @@ def is_animation(path: Path) -> bool:
     if ending == ".json":
         return is_weight_json(path)
     return ending in (".safetensors", *RECORDING_ENDINGS, *MESH_ENDINGS, *SCENE_ENDINGS)
+
+
+def known_rate(stated: float | None, fps: float | None) -> float:
+    """Frames a second: as asked for, else as the file has them, else 30."""
+    return fps or stated or DEFAULT_FPS
+
+
+def rate_notes(path: Path, stated: float | None, fps: float | None) -> list[str]:
+    """Says where a rate was assumed, or is another than the file's."""
+    if fps is not None and stated is not None and abs(fps / stated - 1) > _SAME_RATE:
+        return [f"warning: {path.name} has {stated:g} frames a second; {fps:g} are taken (--fps)"]
+    if fps is not None or stated is not None:
+        return []
+    return [f"{path.name} has no frame rate; {DEFAULT_FPS:g} a second are assumed (--fps)"]
 
 
 def _is_take(file: Path) -> bool:

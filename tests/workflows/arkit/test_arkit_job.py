@@ -10,8 +10,9 @@ import pytest
 import torch
 
 from planted.published_heads import codes, expression_basis, flame_arrays, gnm_arrays, gnm_landmarks, head
-from torchface import Mesh, load_mesh, load_rig, load_take, save_mesh, save_rig
+from torchface import Mesh, Take, Track, load_mesh, load_rig, load_take, save_mesh, save_rig
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.modeling import HeadModel
 from torchface.progress import silent
 from torchface.rig import BlendshapeRig
@@ -228,6 +229,38 @@ def test_missing_frames_are_counted_and_times_that_fall_refused(
     (tmp_path / "a.json").write_text(json.dumps([{"vertices": [[0, 0, 0]] * 1220}]))
     with pytest.raises(FileFormatError, match=f"vertices of 1220, expected the head's {len(rig.vertices)} vertices"):
         animation_to_weights(folder / "rig.glb", tmp_path / "a.json", out, ALONE, silent)
+
+
+def test_the_rate_is_the_files_and_another_is_said(
+    folder: Path, rig: BlendshapeRig, weights: torch.Tensor, tmp_path: Path
+) -> None:
+    out, meshes = tmp_path / "w.csv", rig(weights[:4]).numpy()
+    np.savez(tmp_path / "stated.npz", vertices=meshes, fps=25)
+    np.savez(tmp_path / "unstated.npz", vertices=meshes)
+
+    def lines_of(name: str, fps: float | None) -> str:
+        settings = AnimationSettings(temporal=False, fps=fps)
+        return "\n".join(animation_to_weights(folder / "rig.glb", tmp_path / name, out, settings, silent))
+
+    for name, fps, taken, said in (
+        ("stated.npz", None, 25, ""),
+        ("stated.npz", 25.0, 25, ""),
+        ("stated.npz", 50.0, 50, "warning: stated.npz has 25 frames a second; 50 are taken (--fps)"),
+        ("unstated.npz", None, 30, "unstated.npz has no frame rate; 30 a second are assumed (--fps)"),
+        ("unstated.npz", 24.0, 24, ""),
+    ):
+        lines = lines_of(name, fps)
+        assert load_take(out).fps == pytest.approx(taken)
+        assert f"4 frames at {taken} a second" in lines
+        assert said in lines
+        assert ("(--fps)" in lines) is bool(said)
+    for wrong in (np.zeros(0), -1.0):
+        np.savez(tmp_path / "wrong.npz", vertices=meshes, fps=wrong)
+        with pytest.raises(FileFormatError, match=r"found fps of|frames a second, expected"):
+            lines_of("wrong.npz", None)
+    save_weights_csv(Take(24.0, weights=Track(["jawOpen"], torch.zeros(3, 1, 1))), tmp_path / "named.csv")
+    with pytest.raises(ValueRangeError, match=r"--fps: found 60, expected none beside weights, .* 24 a second"):
+        lines_of("named.csv", 60.0)
 
 
 def test_shapes_that_a_rig_has_are_kept_and_only_the_others_made(rig: BlendshapeRig, tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping, recognised_shapes
 from torchface.take import Take, Track
 from torchface.viz.figures.character_views import SHOWN, character_sheet
+from torchface.workflows.animated_meshes import known_rate, rate_notes
 from torchface.workflows.arkit.arkit_rig import Source, is_annotated, load_source, make_arkit
 from torchface.workflows.arkit.head_parameters import (
     HeadParameters,
@@ -36,7 +37,6 @@ from torchface.workflows.rig.character_rig import PICTURE_ENDING
 from torchface.workflows.weight_files import WeightFiles, write_weights
 
 _ENOUGH = 45  # of ARKit's shapes: such a rig is taken as it is
-_FPS = 30.0
 _UNITS = (1.0, 10.0, 1000.0)
 _UNIT_NAMES = {1.0: "millimetres", 10.0: "centimetres", 1000.0: "metres"}
 _SHOWN_FRAMES = 200
@@ -100,6 +100,10 @@ def animation_to_weights(
         check_rate(settings.fps, "--fps", ValueRangeError)
     progress("reading the animation")
     if (named := _named_weights(animation)) is not None:
+        if rate_notes(animation, named.fps, settings.fps):
+            raise ValueRangeError(
+                f"--fps: found {settings.fps:g}, expected none beside weights, which {animation} has {named.rate}"
+            )
         return _renamed(named, animation, files)
     head = load_source(source, settings.unit)
     moving = load_moving_head(animation, head)
@@ -110,7 +114,7 @@ def animation_to_weights(
     solver = MeshSolver(rig)
     scale, note = _unit_factor(solver, moving.read(0, 1)[0], animation)
     read = (lambda begin, end: moving.read(begin, end) * scale) if note else moving.read
-    fps = settings.fps or moving.fps or _FPS
+    fps = known_rate(moving.fps, settings.fps)
     solution = solver.solve(read, moving.count, fps, settings.temporal, progress)
     broken = _broken_frames(solution, animation)
     take = Take(fps, weights=Track(rig.names, solution.weights.float()[..., None]))
@@ -122,7 +126,8 @@ def animation_to_weights(
         *moving.notes,
         *note,
         *broken,
-        *solution_lines(solution),
+        *rate_notes(animation, moving.fps, settings.fps),
+        *solution_lines(solution, fps),
         *unsaid_lines(solver, solution, read, rig),
     ]
     if moving.parameters is not None and head.model is not None:
@@ -197,7 +202,7 @@ def _renamed(take: Take, path: Path, files: WeightFiles) -> list[str]:
     values = take.weights.values[..., 0] @ matrix.T
     write_weights(replace(take, weights=Track(ARKIT, values[..., None])), files, _no_rig())
     left = f"; ARKit has no {', '.join(lost[:8])}" + (f" and {len(lost) - 8} more" if len(lost) > 8 else "")
-    return [f"{len(take)} frames of weights by name{left if lost else ''}"]
+    return [f"{len(take)} frames of weights by name, {take.rate}{left if lost else ''}"]
 
 
 def _no_rig() -> BlendshapeRig:
@@ -248,13 +253,14 @@ def _write_errors(solution: MeshSolution, fps: float, path: Path) -> None:
     write_file(path, ("\n".join(rows) + "\n").encode())
 
 
-def solution_lines(solution: MeshSolution) -> list[str]:
-    """What the weights leave, for people to read."""
+def solution_lines(solution: MeshSolution, fps: float) -> list[str]:
+    """How many frames there are, and what the weights leave, for people to read."""
     error, motion = solution.error, solution.motion
     share = float(error.square().sum() / motion.square().sum().clamp(min=1e-12))
     return [
-        f"{len(error)} frames; error {float(error.mean()):.3f} mm (root mean square over the vertices, mean of frames; "
-        f"95 % of the frames below {float(error.quantile(0.95)):.3f}) of {float(motion.mean()):.2f} mm of motion, "
+        f"{len(error)} frames at {fps:.6g} a second; error {float(error.mean()):.3f} mm (root mean square over the "
+        f"vertices, mean of frames; 95 % of the frames below {float(error.quantile(0.95)):.3f}) of "
+        f"{float(motion.mean()):.2f} mm of motion, "
         f"{share:.1%} of its energy; least squares without bounds {float(solution.unbounded.mean()):.3f} mm"
     ]
 

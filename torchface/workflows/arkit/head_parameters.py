@@ -69,13 +69,19 @@ def read_parameters(arrays: ArrayFile, model: HeadModelFile) -> HeadParameters:
         person = _table(arrays, key).mean(0)
         person = person[: len(model.identity)]
     rotations = _rotations(arrays, model.joints, len(values), used)
-    fps = None
-    if (key := arrays.first(_RATES)) is not None:
-        used.add(key)
-        fps = float(arrays.numbers(key, *arrays.shape(key)).flatten()[0])
-        check_rate(fps, f"{arrays.path}: {key}")
-    unread = tuple(name for name in arrays.names if name not in used)
-    return HeadParameters(values, rotations, person, fps, unread)
+    unread = tuple(name for name in arrays.names if name not in used and name not in _RATES)
+    return HeadParameters(values, rotations, person, stated_rate(arrays), unread)
+
+
+def stated_rate(arrays: ArrayFile) -> float | None:
+    """Frames a second, where a file of arrays says so."""
+    key = arrays.first(_RATES)
+    if key is None:
+        return None
+    values = arrays.numbers(key, *arrays.shape(key)).flatten()
+    if not len(values):
+        raise arrays.error(key, "frames a second")
+    return check_rate(float(values[0]), f"{arrays.path}: {key}")
 
 
 def _table(arrays: ArrayFile, key: str) -> Tensor:

@@ -18,6 +18,7 @@ from torchface.workflows.arkit.head_parameters import (
     HeadParameters,
     has_parameters,
     read_parameters,
+    stated_rate,
 )
 
 MAX_JSON = 2**30
@@ -104,7 +105,7 @@ def _of_array(arrays: ArrayFile, key: str, vertices: int) -> MovingHead:
     if (not flat and (len(shape) != 3 or shape[1:] != (vertices, 3))) or not shape[0]:
         raise arrays.error(key, f"(T,{vertices},3) vertices of the head")
     meshes = arrays.numbers(key, *shape).reshape(-1, vertices, 3)
-    return MovingHead(len(meshes), lambda begin, end: meshes[begin:end])
+    return MovingHead(len(meshes), lambda begin, end: meshes[begin:end], stated_rate(arrays))
 
 
 def _face_anchors(path: Path, vertices: int) -> MovingHead:

@@ -11,16 +11,14 @@ from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, similarity_transform
 from torchface.mesh import Mesh
 from torchface.take import Take
-from torchface.workflows.animated_meshes import AnimatedMesh
+from torchface.workflows.animated_meshes import AnimatedMesh, known_rate, rate_notes
 
-DEFAULT_FPS = 30.0
 SAME_TOPOLOGY = "meshes of the model's topology"
 OTHER_ACTOR_MM, NO_HEAD_MM = 4.0, 20.0
 OWN_HEAD_MM = 1.0
 """From how far on an input's face at rest is its own head: without it, at 1.3 mm, the model added 0.22 mm to another
 person's smooth frames (root mean square), with it 0.13 as to the actor's."""
 SAMPLED = 24  # frames of an animation, in which one at rest is looked for
-_SAME_RATE = 2e-3  # relative; 29.97 and 30 are the same
 _UNITS = ((1000.0, "metres"), (10.0, "centimetres"), (25.4, "inches"), (0.001, "micrometres"))
 
 
@@ -68,11 +66,11 @@ def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> Coa
         SAME_TOPOLOGY,
         animated.count,
         read,
-        known_rate(animated, fps),
+        known_rate(animated.fps, fps),
         read,
         model.faces,
         residual,
-        (*rate_notes(animated, fps), *notes),
+        (*rate_notes(animated.path, animated.fps, fps), *notes),
         animated.neutral.vertices.float() if another else None,
     )
 
@@ -96,20 +94,6 @@ def resampling_note(path: Path, take: Take, even: Take) -> str:
         f"{path}: found {len(take)} frames {take.rate}; brought to {len(even)} at an even {even.fps:g} a second, "
         "linear in between"
     )
-
-
-def known_rate(animated: AnimatedMesh, fps: float | None) -> float:
-    """Frames a second: as asked for, else as the file has them, else 30."""
-    return fps or animated.fps or DEFAULT_FPS
-
-
-def rate_notes(animated: AnimatedMesh, fps: float | None) -> list[str]:
-    """Says where a rate was assumed, or is another than the file's."""
-    if fps is not None and animated.fps is not None and abs(fps / animated.fps - 1) > _SAME_RATE:
-        return [f"warning: {animated.path.name} has {animated.fps:g} frames a second; {fps:g} are taken (--fps)"]
-    if fps is not None or animated.fps is not None:
-        return []
-    return [f"{animated.path.name} has no frame rate; {DEFAULT_FPS:g} a second are assumed (--fps)"]
 
 
 def check_finite(vertices: Tensor, path: Path, step: int, begin: int = 0) -> None:

@@ -13,12 +13,10 @@ from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.tables.csv_table import TableReader
 from torchface.mesh import Mesh
 from torchface.progress import Progress
-from torchface.workflows.animated_meshes import AnimatedMesh, load_animated, moved_mesh
+from torchface.workflows.animated_meshes import AnimatedMesh, known_rate, load_animated, moved_mesh, rate_notes
 from torchface.workflows.enhance.coarse_animation import (
     CoarseAnimation,
     check_finite,
-    known_rate,
-    rate_notes,
     resampling_note,
     same_topology,
 )
@@ -119,11 +117,11 @@ def other_topology(
         "meshes of another topology",
         animated.count,
         read,
-        known_rate(animated, fps),
+        known_rate(animated.fps, fps),
         lambda begin, end: placed(correspondence.pose, animated.read(begin, end)),
         animated.neutral.faces,
         correspondence.residual,
-        (*rate_notes(animated, fps), *assumed, *correspondence.notes(animated.path), PLACE),
+        (*rate_notes(animated.path, animated.fps, fps), *assumed, *correspondence.notes(animated.path), PLACE),
     )
 
 
