@@ -36,6 +36,7 @@ LARGEST_WEIGHT = 5.0  # nobody drives a shape so far; where a tenth of the frame
 LARGEST_ANGLE = math.pi  # no rotation in radians is larger; where it is in a tenth of the frames, it is in degrees
 
 _SHARE, _MOST_PERCENT, _MOST_DEGREES = 0.1, 200.0, 360.0
+_LARGEST_OVERSHOOT = 1.5  # of an action unit from 0 to 1; one that is larger is an intensity
 
 
 def load_take(path: str | Path, unit: str | None = None) -> Take:
@@ -163,7 +164,7 @@ def in_usual_units(take: Take, path: Path) -> Take:
     """The take with weights from 0 to 1 and rotations in radians; what is converted, a ``UserWarning`` says."""
     if take.weights is not None and all(map(is_action_unit, take.weights.names)):
         most = float(take.weights.values.nan_to_num(0.0).max()) if take.weights.values.numel() else 0.0
-        if 1.0 < most <= LARGEST_INTENSITY:
+        if _LARGEST_OVERSHOOT < most <= LARGEST_INTENSITY:
             _warn(path, f"action units up to {most:.4g}", "0 to 1", "intensities from 0 to 5")
             scaled = take.weights.values / LARGEST_INTENSITY
             return replace(take, weights=Track(take.weights.names, scaled, take.weights.confidence))

@@ -31,3 +31,9 @@ def test_a_plain_table_of_action_units_to_five_is_taken_for_intensities(tmp_path
     assert take.weights.values[:, 1, 0].tolist() == pytest.approx([0.8, 0.4])
     (tmp_path / "one.csv").write_text("frame,time,AU01,AU12\n0,0.0,0,0.8\n1,0.04,1,0.4\n")
     assert load_take(tmp_path / "one.csv").weights.values[:, 1, 0].tolist() == pytest.approx([0.8, 0.4])
+
+
+@pytest.mark.parametrize("most", [1.0000001, 1.02, 1.4])
+def test_weights_of_action_units_that_overshoot_one_stay(most: float, tmp_path: Path) -> None:
+    (tmp_path / "over.csv").write_text(f"frame,time,AU01,AU12\n0,0.0,0,0.5\n1,0.04,1,{most}\n")
+    assert load_take(tmp_path / "over.csv").weights.values[:, 1, 0].tolist() == pytest.approx([0.5, most])
