@@ -18,6 +18,7 @@ from torchface.io.images.image_files import load_image, save_image
 from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
+from torchface.workflows.fit import fit_checks
 from torchface.workflows.fit.fit_checks import ALONE, one_person_lines
 from torchface.workflows.fit.fit_landmarks import landmarks_of
 from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs
@@ -164,3 +165,22 @@ def test_like_heads_with_other_hair_and_lips_are_warned_of_and_not_refused() -> 
     (line,) = lines(other)
     assert "may show different people" in line
     assert "with the colours of hair, brows and lips a.png" in line
+
+
+def test_a_photograph_that_form_and_colours_call_another_persons_is_refused_beside_a_less_likely_one(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    # The form of the first speaks for it, so that its colours, which are the least likely, do not refuse it.
+    form, colors = torch.tensor([0.5, -0.5, 3.0]).double(), torch.tensor([-6.0, -4.0, 0.0]).double()
+    monkeypatch.setattr(fit_checks, "same_person", lambda _: form)
+    monkeypatch.setattr(fit_checks, "color_evidence", lambda _: colors)
+    fit = SimpleNamespace(errors=torch.ones(1), landmarks=torch.rand(1, 68, 2))
+    names, marks = [Path(f"{i}.png") for i in range(3)], torch.rand(3, 68, 2)
+
+    def lines(insist: bool) -> list[str]:
+        return one_person_lines(names, marks, [fit] * 3, lambda *_: fit, insist, colors=torch.zeros(3, 4))
+
+    with pytest.raises(AlignmentError, match=r"^1\.png: shows another person"):
+        lines(False)
+    (line,) = lines(True)
+    assert "may show different people" in line

@@ -105,7 +105,6 @@ def one_person_lines(
     both = sure if colors is None else (form.clamp(max=FORM_SAYS) + color_evidence(colors)).sigmoid()
     if float(both.min()) >= expected and float(sure.min()) >= DOUBTED:
         return []
-    worst = int(both.argmin())
     joint = float(misfits(bare(marks, list(range(len(marks))))).square().mean().sqrt())
     each = float(torch.stack([misfits(fit)[0] for fit in alone]).square().mean().sqrt())
     listed, with_colors = (
@@ -118,7 +117,9 @@ def one_person_lines(
         f"above {expected:.0%}; landmarks lie {joint:.1%} of the eyes' distance from one head "
         f"for all, {each:.1%} from a head for each"
     )
-    if float(both[worst]) < OTHERS and float(form[worst]) < 0 and not insist:
+    others = (both < OTHERS) & (form < 0)
+    if bool(others.any()) and not insist:
+        worst = int(both.where(others, torch.inf).argmin())
         raise AlignmentError(
             f"{photographs[worst].name}: shows another person than the rest, or its landmarks are wrong ({figures}); "
             "leave it out, or --insist to fit them anyway"
