@@ -22,7 +22,7 @@ from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.progress import Progress, silent
 from torchface.shape_names import ARKIT
 from torchface.take import Take, Track
-from torchface.workflows.track.head_rotations import eye_angles, head_angles
+from torchface.workflows.head_rotations import eye_angles, head_angles
 
 from .rendered_people.webcam_film import FPS, Film, FilmSources, Scene, webcam_film
 from .rendered_people.webcam_performance import SittingSettings, gaze_of

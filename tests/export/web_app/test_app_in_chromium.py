@@ -19,7 +19,7 @@ from torchface.io import load_rig, load_take
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.weights.live_link_csv import load_live_link
 from torchface.shape_names import ARKIT
-from torchface.workflows.track.head_rotations import head_angles
+from torchface.workflows.head_rotations import head_angles
 
 pytestmark = pytest.mark.browser
 BROWSERS_OWN = ("google.com", "googleapis.com", "gstatic.com", "gvt1.com", "duckduckgo.com")

@@ -27,7 +27,7 @@ from torchface.io.protocols.vmc_packets import VmcPackets
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.shape_names import ARKIT, VRM1, mapping
 from torchface.workflows.browser_app.character import load_character
-from torchface.workflows.track.head_rotations import head_angles
+from torchface.workflows.head_rotations import head_angles
 
 pytestmark = pytest.mark.browser
 VRM_WEB = Path(__file__).parents[2] / "io" / "vrm" / "web"

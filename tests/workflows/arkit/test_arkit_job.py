@@ -1,6 +1,7 @@
 """Tests of ``torchface arkit`` from files to files, on planted models of the embedded performer's head."""
 
 import json
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,7 +13,7 @@ import torch
 from planted.published_heads import codes, expression_basis, flame_arrays, gnm_arrays, gnm_landmarks, head
 from torchface import Mesh, Take, Track, load_mesh, load_rig, load_take, save_mesh, save_rig
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.io.weights.weight_csv import save_weights_csv
+from torchface.io.weights.weight_csv import ROTATIONS, save_weights_csv
 from torchface.modeling import HeadModel
 from torchface.progress import silent
 from torchface.rig import BlendshapeRig
@@ -98,7 +99,13 @@ def test_codes_become_the_planted_weights_and_go_back(
     settings = AnimationSettings(folder / "template.glb", temporal=False)
     lines = animation_to_weights(folder / "flame.npz", folder / "take.npz", tmp_path / "w.csv", settings, silent)
     assert float((solved(tmp_path / "w.csv", rig) - weights).abs().max()) < 0.04
-    assert load_take(tmp_path / "w.csv").fps == pytest.approx(60.0)
+    take = load_take(tmp_path / "w.csv")
+    assert take.fps == pytest.approx(60.0)
+    assert float(weights[:, rig.index(["eyeLookInRight"])].max()) > 0.5
+    for name in ROTATIONS:  # the right eye looks in, to the left: by 30 degrees at weight 1, as it is carried over
+        turned = -math.radians(30) if name == "RightEyeYaw" else 0.0
+        expected = turned * take.weights.select(["EyeLookInRight"]).values[:, 0, 0].double()
+        torch.testing.assert_close(take.extras["columns"][name], expected, atol=1e-3, rtol=0.03)
     assert any("left out of take.npz: cam" in line for line in lines)
     table = np.loadtxt(tmp_path / "w_error.csv", delimiter=",", skiprows=1)
     assert table.shape == (FRAMES, 5)
@@ -279,14 +286,16 @@ def test_shapes_that_a_rig_has_are_kept_and_only_the_others_made(rig: Blendshape
 def test_audio2faces_weights_go_by_name(tmp_path: Path) -> None:
     document = {
         "exportFps": 25.0,
-        "facsNames": ["jawOpen", "eyeBlinkLeft", "tongueTipUp"],
-        "weightMat": [[0.5, 0, 0.2]],
+        "facsNames": ["jawOpen", "eyeLookUpLeft", "tongueTipUp"],
+        "weightMat": [[0.5, 0.4, 0.2]],
     }
     (tmp_path / "a2f.json").write_text(json.dumps(document))
     lines = animation_to_weights(tmp_path / "none.glb", tmp_path / "a2f.json", tmp_path / "w.csv", ALONE, silent)
     take = load_take(tmp_path / "w.csv")
     assert float(take.weights.select(["JawOpen"]).values[0]) == pytest.approx(0.5)
     assert "ARKit has no tongueTipUp" in lines[0]
+    assert float(take.extras["columns"]["LeftEyePitch"]) == pytest.approx(-0.4 * math.radians(26), abs=0.002)
+    assert float(take.extras["columns"]["RightEyePitch"]) == 0
 
 
 @pytest.mark.bench

@@ -12,8 +12,8 @@ from torchface.synthetic import performer
 from torchface.workflows.examples import live_examples
 from torchface.workflows.examples.example_take import Method
 from torchface.workflows.examples.live_examples import ExamplesSolver
+from torchface.workflows.head_rotations import head_angles
 from torchface.workflows.named_finders import NamedFinder
-from torchface.workflows.track.head_rotations import head_angles
 
 
 @pytest.mark.parametrize("method", ["all", "regional", "linear"])

@@ -19,12 +19,12 @@ from torchface.io.video import open_video
 from torchface.io.video.video_packets import pyav
 from torchface.shape_names import ARKIT
 from torchface.workflows.browser_app.character import load_character
+from torchface.workflows.head_rotations import head_rotations
 from torchface.workflows.live import recordings as recordings_module
 from torchface.workflows.live.kept_takes import film_of, kept_takes, remove_take, take_file
 from torchface.workflows.live.live_anybody import import_recordings
 from torchface.workflows.live.live_frames import LiveFrame
 from torchface.workflows.live.recordings import FrameLog, Recordings
-from torchface.workflows.track.head_rotations import head_rotations
 
 
 def test_uneven_frames_keep_their_times(dome: Path, tmp_path: Path) -> None:

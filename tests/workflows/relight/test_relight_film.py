@@ -26,6 +26,7 @@ from torchface.rendering.texture_overlay import relight, skin_faces
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import neutral_head, performer
 from torchface.take import Take, Track
+from torchface.workflows.head_rotations import rotation_columns
 from torchface.workflows.relight.other_head import other_head, without_painted_hair
 from torchface.workflows.relight.relight_film import (
     RelightSettings,
@@ -39,7 +40,6 @@ from torchface.workflows.relight.relight_film import (
 )
 from torchface.workflows.relight.tracked_film import bare, read_tracked_film
 from torchface.workflows.relight.wanted_light import WantedLight
-from torchface.workflows.track.head_rotations import rotation_columns
 from torchface.workflows.track.track_files import ANIMATION, LANDMARKS, SUMMARY, SUMMARY_FORMAT
 
 LAMP = PointLight.directional(torch.full((3,), 0.3), torch.full((3,), 0.8), torch.tensor([-0.8, -0.3, -0.6]))

@@ -20,7 +20,7 @@ from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.video import VideoFile, open_video, write_video
 from torchface.shape_names import ARKIT
 from torchface.synthetic.head.performer import performer
-from torchface.workflows.track.head_rotations import head_angles
+from torchface.workflows.head_rotations import head_angles
 from torchface.workflows.track.overlay_video import head_window, mesh_drawer, undistorted
 from torchface.workflows.track.take_solution import known_offsets
 from torchface.workflows.track.track_inputs import TrackInputs, TrackSettings

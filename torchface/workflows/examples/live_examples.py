@@ -13,9 +13,9 @@ from torchface.progress import Progress, silent
 from torchface.shape_names import ARKIT
 from torchface.viz.figures.landmark_dots import with_dots
 from torchface.workflows.examples.example_take import Method, averaged_examples, example_solver
+from torchface.workflows.head_rotations import head_rotations
 from torchface.workflows.live.live_frames import LiveFrame, planes
 from torchface.workflows.named_finders import DEFAULT_LANDMARKS, graph_detector, load_finder
-from torchface.workflows.track.head_rotations import head_rotations
 
 
 class ExamplesSolver:

@@ -16,8 +16,8 @@ from torchface.io.weights.live_link_csv import load_live_link
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.shape_names import ARKIT, mapping
 from torchface.take import Take
+from torchface.workflows.head_rotations import head_rotations
 from torchface.workflows.live.take_film import FILM
-from torchface.workflows.track.head_rotations import head_rotations
 
 WEIGHTS, LIVE_LINK, ANIMATION, SUMMARY = "weights.csv", "live_link.csv", "animation.glb", "summary.json"
 

@@ -15,8 +15,8 @@ from torch import Tensor
 
 from torchface.capture.anybody import WebcamControls
 from torchface.io.video import VideoFile, open_video
+from torchface.workflows.head_rotations import eye_angles, head_angles
 from torchface.workflows.live.camera import DEFAULT_SIZE, Camera
-from torchface.workflows.track.head_rotations import eye_angles, head_angles
 
 Say = Callable[[str], None]
 """Takes a sentence for the user."""

@@ -20,9 +20,9 @@ from torchface.io.tables.frame_rates import measured_rate, usual_rate
 from torchface.io.video import VideoFile
 from torchface.shape_names import ARKIT
 from torchface.temporal.one_euro import OneEuroSettings, one_euro_step
+from torchface.workflows.head_rotations import head_rotations
 from torchface.workflows.live.live_frames import LiveFrame, Say
 from torchface.workflows.live.session_prompts import STEPS
-from torchface.workflows.track.head_rotations import head_rotations
 
 _FPS = 60.0  # of phones, where times do not say
 _SIZE = (480, 360)

@@ -16,7 +16,7 @@ from torchface.io.video import VideoFile, open_video
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.part_materials import part_material
 from torchface.rig import BlendshapeRig
-from torchface.workflows.track.head_rotations import head_rotations
+from torchface.workflows.head_rotations import head_rotations
 from torchface.workflows.track.track_files import ANIMATION, LANDMARKS, SUMMARY, SUMMARY_FORMAT
 from torchface.workflows.track.upright_rig import upright
 

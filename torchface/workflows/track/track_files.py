@@ -9,7 +9,7 @@ from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.landmarks.images.tracking.video_landmarks import LANDMARK_NAMES
 from torchface.shape_names import ARKIT, mapping
 from torchface.take import Take, Track
-from torchface.workflows.track.head_rotations import rotation_columns
+from torchface.workflows.head_rotations import rotation_columns
 from torchface.workflows.track.take_solution import OFFSETS
 from torchface.workflows.track.track_result import Tracked
 from torchface.workflows.weight_files import reduced_take, write_animation

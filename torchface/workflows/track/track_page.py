@@ -11,8 +11,8 @@ from torchface.evaluation import weight_jitter
 from torchface.rendering.compositing import caption, sheet
 from torchface.viz.figures.curves import error_curve, motion_curves, weight_curves
 from torchface.viz.reports.report_page import Section, Table, write_page
+from torchface.workflows.head_rotations import head_angles
 from torchface.workflows.track.frame_readings import shown_frames
-from torchface.workflows.track.head_rotations import head_angles
 from torchface.workflows.track.overlay_video import camera_at, mesh_drawer, side_by_side_drawer
 from torchface.workflows.track.track_result import MIN_STABLE, Tracked
 

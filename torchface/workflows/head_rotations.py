@@ -3,7 +3,9 @@
 import torch
 from torch import Tensor
 
+from torchface.capture.own_rig.eye_geometry import LOOKS, gaze_of_looks
 from torchface.io.weights.weight_csv import ROTATIONS
+from torchface.take import Track
 
 
 def head_angles(rotation: Tensor) -> Tensor:
@@ -45,6 +47,17 @@ def eye_angles(gaze: Tensor) -> Tensor:
     """
     still = gaze.new_zeros(*gaze.shape[:-1], 1)
     return torch.cat([-gaze.flip(-2), still], -1).flatten(-2)
+
+
+def still_head_columns(weights: Track, turns: Tensor) -> dict[str, Tensor]:
+    """Live Link Face's nine columns of a head that does not turn, whose eyes look where weights (T,52) of ARKit say.
+
+    Args:
+        turns: by what each shape of ``LOOKS`` turns its eye at weight 1, (8,) radians; see :class:`Eyeballs`.
+    """
+    looks = weights.select(LOOKS).values[..., 0].double()
+    ahead = torch.tensor([1.0, -1.0, -1.0]).diag().expand(len(weights), 3, 3)
+    return rotation_columns(ahead, gaze_of_looks(looks, turns).nan_to_num(0.0))
 
 
 def rotation_columns(rotation: Tensor, gaze: Tensor) -> dict[str, Tensor]:
