@@ -8,7 +8,7 @@ from torch import Tensor
 
 from planted.characters import caricature
 from torchface.cli import main
-from torchface.errors import AlignmentError, TopologyError
+from torchface.errors import TopologyError
 from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_rig, save_mesh, save_rig
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
@@ -98,10 +98,28 @@ def test_a_pose_that_a_head_does_not_show_is_named(
     assert "warning: the head shows nothing of jawOpen=1" in " ".join(capsys.readouterr().err.split())
 
 
-def test_the_templates_own_expression_is_refused(actor: BlendshapeRig) -> None:
+def test_the_templates_own_expression_is_named_with_its_weights(actor: BlendshapeRig) -> None:
     smile = actor.neutral.with_vertices(actor.vertices + shown(actor, mouthSmile=1.0))
-    with pytest.raises(AlignmentError, match=r"template's own head .*mouthSmile(Left|Right)=1\.0 .*expected one at"):
-        neutral_notes(actor, smile)
+    (note,) = neutral_notes(actor, smile)
+    assert "the template's own head in an expression" in note
+    assert "--pose mouthSmileLeft=1.0 mouthSmileRight=1.0 takes" in note or "mouthSmileRight=1.0 mouthSmileLeft" in note
+
+
+def test_shapes_that_make_another_person_are_no_expressions(actor: BlendshapeRig) -> None:
+    vertices, tip = actor.vertices, actor.vertices[actor.vertices[:, 2].argmax()]
+    away = (vertices - tip).norm(dim=1, keepdim=True)
+    nose = torch.tensor([0.0, -2.0, 9.0]) * torch.exp(-((away / 14) ** 2))
+    wide = (vertices - vertices.mean(0)) * torch.tensor([0.12, 0.0, 0.0])
+    deltas = torch.cat([actor.deltas, nose[None], wide[None]])
+    template = BlendshapeRig(actor.neutral, deltas, (*actor.names, "identityNoseBig", "identityWide"))
+    for person in (vertices + 0.7 * nose, vertices + 0.8 * wide, vertices + nose + wide):
+        assert neutral_notes(template, actor.neutral.with_vertices(person)) == ()
+        (note,) = neutral_notes(template, actor.neutral.with_vertices(person + shown(actor, jawOpen=0.7)))
+        assert "--pose jawOpen=0." in note
+
+
+def test_a_template_without_shapes_shows_no_expression(actor: BlendshapeRig, people: list[Mesh]) -> None:
+    assert neutral_notes(actor.select([]), people[0]) == ()
 
 
 @pytest.mark.parametrize(("axis", "word"), [(0, "as wide"), (1, "as high"), (2, "as deep")])

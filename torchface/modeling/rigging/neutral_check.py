@@ -3,13 +3,14 @@
 import torch
 from torch import Tensor
 
-from torchface.errors import AlignmentError, TopologyError
+from torchface.errors import TopologyError
 from torchface.geometry.meshes.operators import edges
 from torchface.geometry.meshes.unit_check import extent
 from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh
 from torchface.optim.box_qp import box_qp
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT, recognised_mapping
 
 # A shape is in a head where its weight, its share of how the head differs from the template where the shape acts, and
 # its way exceed these together: none in 182 heads at rest (drawn for the performer, ICT's modes, registered scans,
@@ -27,12 +28,13 @@ _NAMED = 4
 def neutral_notes(template: BlendshapeRig, head: Mesh) -> tuple[str, ...]:
     """What makes it likely that a head is not a template's at rest, a sentence each; none for a head at rest.
 
+    Of a template with shapes that mean some of ARKit's the others are no expressions, such as a wider nose.
+
     Args:
         template: N shapes, V vertices, millimetres.
         head: of the template's topology, in any place and size.
 
     Raises:
-        AlignmentError: the head is the template's own in an expression.
         TopologyError: another number of vertices.
 
     Example:
@@ -61,7 +63,7 @@ def neutral_notes(template: BlendshapeRig, head: Mesh) -> tuple[str, ...]:
             f"people differ by up to 1.2: was it scaled unevenly?"
         )
         placed = (placed - placed[used].mean(0)) @ torch.linalg.inv(affine).T + own.mean(0)
-    return (*notes, *_expression_notes(template, rest, placed))
+    return (*notes, *(_expression_notes(template, rest, placed) if template.names else ()))
 
 
 def _affine(rest: Tensor, goal: Tensor) -> tuple[Tensor, float]:
@@ -121,6 +123,9 @@ def _expression_notes(template: BlendshapeRig, rest: Tensor, goal: Tensor) -> li
     signal = found.square() * (energy * where).sum(1)
     share = signal / (signal + where @ fit.left(found)).clamp(min=1e-12)
     there = (found > _WEIGHT) & (share > _SHARE) & (found * way > _WAY)
+    expressions = recognised_mapping(template.names, ARKIT).any(0)
+    if bool(expressions.any()):
+        there &= expressions
     if not bool(there.any()):
         return []
     exact = fit.weights(_EXACT_RIDGE)
@@ -129,7 +134,7 @@ def _expression_notes(template: BlendshapeRig, rest: Tensor, goal: Tensor) -> li
     order = [i for i in (values * way).argsort(descending=True).tolist() if there[i]][:_NAMED]
     named = " ".join(f"{template.names[i]}={float(values[i]):.1f}" for i in order)
     if own:
-        raise AlignmentError(f"neutral: found the template's own head in an expression ({named}), expected one at rest")
+        return [f"the neutral is the template's own head in an expression; torchface rig --pose {named} takes it out"]
     return [
         f"the neutral is likely not at rest: it differs from the template as {named} does, by up to "
         f"{float(found[order[0]] * way[order[0]]):.0f} mm ({100 * float(share[order[0]]):.0f} % of how it differs "
