@@ -61,8 +61,15 @@ def headed(image: Tensor, text: str) -> Tensor:
 def _line(width: int, text: str, size: int) -> Tensor:
     strip = Image.new("RGB", (width, size + 10), "white")
     draw = ImageDraw.Draw(strip)
-    draw.text((width / 2, (size + 10) / 2), text, fill="black", font=ImageFont.load_default(size), anchor="mm")
+    draw.text((width / 2, (size + 10) / 2), text, fill="black", font=text_font(size), anchor="mm")
     return from_pillow(strip)
+
+
+def text_font(size: int) -> ImageFont.FreeTypeFont:
+    """DejaVu Sans, which matplotlib brings along: Pillow's own font has no letters beyond ASCII."""
+    from matplotlib import get_data_path
+
+    return ImageFont.truetype(Path(get_data_path()) / "fonts" / "ttf" / "DejaVuSans.ttf", size)
 
 
 def sheet(images: Sequence[Tensor], columns: int, gap: int = 4) -> Tensor:

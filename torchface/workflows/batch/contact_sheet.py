@@ -5,13 +5,13 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import torch
-from PIL import Image, ImageDraw, ImageFont
+from PIL import Image, ImageDraw
 from torch import Tensor
 
 from torchface.escaped_text import visible
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, from_pillow, sheet
+from torchface.rendering.compositing import caption, from_pillow, sheet, text_font
 from torchface.viz.figures.face_views import frame_face
 from torchface.workflows.batch.batch_job import picture_path
 from torchface.workflows.batch.outcomes import Outcome
@@ -56,8 +56,7 @@ def _blank(outcome: Outcome, height: int, width: int) -> Tensor:
     view = Image.new("RGB", (width, height), (_SKIPPED,) * 3)
     reason = visible(outcome.error.removeprefix(f"{outcome.item.path}: "))
     lines = textwrap.wrap(reason, max(1, width // _LETTER), max_lines=height // (_TEXT + 4) - 1, placeholder="..")
-    font = ImageFont.load_default(_TEXT)
-    ImageDraw.Draw(view).multiline_text((6, 6), "\n".join(lines), fill="black", font=font)
+    ImageDraw.Draw(view).multiline_text((6, 6), "\n".join(lines), fill="black", font=text_font(_TEXT))
     return from_pillow(view)
 
 
