@@ -40,9 +40,9 @@ class VideoJob:
         done = track_video(item.path, job.rig, folder, job.settings)
         page = write_track_page(done, folder)
         errors = torch.where(done.seen, done.solution.errors, torch.nan)
-        strongest = done.solution.weights[done.solution.weights.norm(dim=1).argmax()].to(done.rig.deltas)
+        strongest = done.solution.weights[done.solution.weights.norm(dim=1).argmax()].to(done.shown.deltas)
         with torch.no_grad():
-            picture = face_picture(done.rig.neutral.with_vertices(done.rig(strongest[None])[0]))
+            picture = face_picture(done.shown.neutral.with_vertices(done.shown(strongest[None])[0]))
         seen, frames = float(done.seen.float().mean()), len(done)
         return Made(
             (*done.products.values(), page),
