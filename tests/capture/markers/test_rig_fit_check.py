@@ -10,6 +10,7 @@ from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver
 from torchface.capture.markers import check_fit
 from torchface.capture.markers.rig_fit_check import unit_of_scale
+from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import Similarity
 from torchface.modeling import transfer_deformation
 from torchface.synthetic import draw_identities, performer
@@ -64,6 +65,31 @@ def test_a_slipping_helmet_is_named_and_passes_once_its_motion_is_taken_out(perf
     assert found.cause == "slip"
     assert found.corrected < 0.2 * found.distance
     assert check_fit(sites(rig, attachment), markers, slip=True).distance == pytest.approx(found.corrected, abs=0.1)
+
+
+@pytest.mark.parametrize("way", [0.0, 4.0, 10.0])
+def test_a_helmet_may_slip_that_carries_five_markers_and_their_sites_are_still_checked(way: float) -> None:
+    rig = performer(texture=False).select(["jawOpen", "mouthSmileLeft", "mouthSmileRight", "browInnerUp"])
+    attachment = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks[[27, 30, 36, 45, 54]])
+    generator = torch.Generator().manual_seed(0)
+    take = record(rig, attachment, torch.rand(40, 4, generator=generator), generator, StageFlaws(noise=0.1)).take
+    phase = torch.linspace(0, 6, 40)
+    slip = rotation_matrix(0.01 * way * torch.stack([phase.sin(), phase.cos(), 0 * phase], 1))
+    shift = way * torch.stack([phase.sin(), 0 * phase, phase.cos()], 1)
+    markers = take.markers.values @ slip.transpose(1, 2) + shift[:, None]
+    found = check_fit(sites(rig, attachment), markers, slip=True)
+    assert found.cause == ""
+    assert found.distance < 0.3
+    others = check_fit(sites(rig, attachment).roll(1, 0), markers, slip=True)
+    assert others.refused
+    assert others.cause == "attachment"
+
+
+def test_a_take_that_shows_nothing_has_no_cause(performance: Performance) -> None:
+    rig, attachment, _ = performance
+    nothing = torch.full((3, 100, 3), torch.nan)
+    found = [check_fit(sites(rig, attachment), nothing, slip) for slip in (False, True)]
+    assert [(each.cause, each.refused) for each in found] == [("", True)] * 2
 
 
 def test_few_markers_close_together_may_stand_off_the_skin(performance: Performance) -> None:

@@ -35,7 +35,7 @@ class FitCheck:
     """How far a rig's markers are from where it can bring their sites.
 
     Args:
-        distance: median over all samples that were seen, millimetres of rig space.
+        distance: median over all samples that were seen, millimetres of rig space; NaN where none was.
         radius: of the sites at rest, mean distance from their centre, millimetres.
         cause: what most likely is wrong: ``unit``, ``alignment``, ``mirror`` (left-handed coordinates, or sides
             swapped), ``motion`` (the head moves freely in the volume), ``slip`` (the helmet moves on the head) or
@@ -127,7 +127,7 @@ def check_fit(affine: Tensor, markers: Tensor, slip: bool = False) -> FitCheck:
     few = markers[~torch.isnan(markers).any(-1).all(1)]
     few = few[:: max(1, len(few) // _FRAMES)]
     if not len(few):
-        return FitCheck(math.nan, radius, "attachment")
+        return FitCheck(math.nan, radius)
     distance = _distance(affine, few)
     found = FitCheck(distance, radius)
     if slip and not found.refused:
@@ -167,7 +167,9 @@ def _uncorrected(found: FitCheck) -> FitCheck:
 
 def _with_slip(affine: Tensor, markers: Tensor, found: FitCheck) -> FitCheck:
     """The check of markers that a rigid motion a frame may move."""
-    return _uncorrected(replace(found, distance=_distance(affine, _without_motion(affine, markers))))
+    # Few markers show a motion badly, and worse if it is not taken out: a slip would seem to be another attachment.
+    least = min(MIN_MARKERS, int(_seen(markers).max()))
+    return _uncorrected(replace(found, distance=_distance(affine, _without_motion(affine, markers, least))))
 
 
 def _is_elsewhere(pose: Similarity, markers: Tensor, radius: float) -> bool:
@@ -201,7 +203,12 @@ def _distance(affine: Tensor, markers: Tensor) -> float:
     return float((markers - on_rig).norm(dim=-1).nanmedian())
 
 
-def _without_motion(affine: Tensor, markers: Tensor) -> Tensor:
-    """Markers (T,M,3) of the frames that show a rigid motion, without it."""
-    markers = markers[(~torch.isnan(markers).any(-1)).sum(1) >= MIN_MARKERS]
+def _seen(markers: Tensor) -> Tensor:
+    """How many markers each frame shows, (T,)."""
+    return (~torch.isnan(markers).any(-1)).sum(1)
+
+
+def _without_motion(affine: Tensor, markers: Tensor, least: int = MIN_MARKERS) -> Tensor:
+    """Markers (T,M,3) of the frames that show at least so many, without their rigid motion."""
+    markers = markers[_seen(markers) >= least]
     return frame_poses(affine, markers, markers.new_ones(()), _RIDGE)[1].apply(markers)
