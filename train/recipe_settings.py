@@ -22,7 +22,8 @@ class RecipeSettings:
     """What the recipe does; fields are flags, and keys of a settings file.
 
     Args:
-        out: Folder for the model, its card and pictures, the settings and the log.
+        out: Folder for the model, its card and pictures, the settings and the log. Its name, which is the model's, has
+            letters from a to z, digits, - and _.
         seed: Decides all that is drawn, but what settings with a seed of their own draw.
         device: Where the recipe computes, such as cpu, cuda, cuda:1 or mps; if absent on a GPU where it can use one
             and there is one.

@@ -72,7 +72,7 @@ def recipe(body: Callable[[Settings, Run], Trained]) -> Train[Settings, Trained]
 
 @contextmanager
 def _running(settings: RecipeSettings, progress: Progress) -> Iterator[Run]:
-    for folder in settings.folders:  # else refused after all the work, when the model is saved
+    for folder in (settings.out, *settings.folders):  # else refused after all the work, when the model is saved
         check_model_name(folder)
     device = settings.chosen_device()
     if not settings.resume:

@@ -151,15 +151,23 @@ def test_a_number_that_no_recipe_can_work_with_is_refused_before_any_work(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("given", ["my model", "prior ü", "_hidden", "a" * 65])
 def test_a_folder_whose_name_no_model_can_have_is_refused_before_any_work(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    given: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    class Two(Settings):
+        @property
+        def folders(self) -> tuple[Path, ...]:
+            return self.out.with_name(f"{self.out.name}_one"), self.out.with_name(f"{self.out.name}_two")
+
     def work(settings: Settings, run: Run) -> None:
         pytest.fail("the work has begun")
 
-    with pytest.raises(SystemExit):
-        Recipe(Settings, recipe(work), None).main(["--data", "here", "--out", str(tmp_path / "my model")])
-    assert "found the name 'my model', expected letters, digits, - and _" in " ".join(capsys.readouterr().err.split())
+    for kind in (Settings, Two):
+        with pytest.raises(SystemExit):
+            Recipe(kind, recipe(work), None).main(["--data", "here", "--out", str(tmp_path / given)])
+        message = " ".join(capsys.readouterr().err.split())
+        assert f"found the name '{given}', expected letters from a to z, digits, - and _, at most 64" in message
     assert not list(tmp_path.iterdir())
 
 

@@ -33,7 +33,7 @@ REPOSITORY = Path(__file__).resolve().parents[2]
 def test_what_is_no_model_cannot_be_saved(tmp_path: Path) -> None:
     with pytest.raises(NameMismatchError, match=r"found a Linear, expected one of .*HeadModel"):
         zoo.save_model(nn.Linear(2, 2), tmp_path / "x", CARD)
-    with pytest.raises(NameMismatchError, match="letters, digits"):
+    with pytest.raises(NameMismatchError, match="letters from a to z, digits"):
         zoo.save_model(morphable(), tmp_path / "..", CARD)
     broken = morphable()
     broken.mean[3, 1] = torch.nan

@@ -14,7 +14,10 @@ MODEL_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")
 def check_model_name(folder: Path) -> None:
     """Raises ``NameMismatchError`` where a folder's name is none for a model."""
     if not MODEL_NAME.fullmatch(folder.name):
-        raise NameMismatchError(f"{folder}: found the name {folder.name!r}, expected letters, digits, - and _")
+        raise NameMismatchError(
+            f"{folder}: found the name {folder.name!r}, expected letters from a to z, digits, - and _, at most 64, the "
+            "first a letter or digit"
+        )
 
 
 def model_roots(package: Path, home: str | None) -> list[Path]:
