@@ -64,6 +64,11 @@ def test_categories_alone_are_read_at_30_frames_a_second(tmp_path: Path) -> None
     with pytest.warns(UserWarning, match=r"bare\.json: found no timestamp in its frames; 30 a second are taken"):
         take = load_take(tmp_path / "bare.json")
     assert (take.fps, len(take)) == (30, 5)
+    (tmp_path / "one.json").write_text(json.dumps(frames[0]["face_blendshapes"][0]))
+    assert is_weight_json(tmp_path / "one.json")
+    with pytest.warns(UserWarning, match=r"one\.json: found no timestamp"):
+        one = load_take(tmp_path / "one.json")
+    torch.testing.assert_close(one.weights.values, take.weights.values[:1])
 
 
 @pytest.mark.parametrize(
@@ -87,6 +92,8 @@ def test_categories_alone_are_read_at_30_frames_a_second(tmp_path: Path) -> None
         ([[{"category_name": "wing", "score": 1}]], "expected a category with one of ARKit's names and a score"),
         ([[{"category_name": "jawOpen", "score": "wide"}]], "score = 'wide', expected a score"),
         ([[{"category_name": "jawOpen", "score": 1}], 5], "expected MediaPipe's categories"),
+        ([{"faceBlendshapes": []}] * 3, "found no face in any of 3 frames, expected MediaPipe's"),
+        ([[{"category_name": "_neutral", "score": 1}]], "found no category but _neutral, expected MediaPipe's"),
     ],
 )
 def test_what_is_no_recording_is_refused(document: object, found: str, tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ def is_weight_json(path: str | Path) -> bool:
     if isinstance(document, dict) and "weightMat" in document:
         return True
     frames = document.get("frames") if isinstance(document, dict) else document
-    if isinstance(document, dict) and frames is None:
+    if (isinstance(document, dict) and frames is None) or _is_face(frames):
         frames = [document]
     if not isinstance(frames, list) or not frames:
         return False
@@ -48,8 +48,8 @@ def load_weight_json(path: str | Path) -> Take:
     Frames are a list, or a table with the list ``frames``. Those of face anchors have ``timestamp`` in seconds,
     ``blendShapes`` with numbers by ARKit's names and, where the app wrote them, ``transform``, ``leftEyeTransform`` and
     ``rightEyeTransform``: 16 numbers by columns, or four columns of four. Those of MediaPipe are a result as it is
-    printed in Python or JavaScript, or its categories alone (``category_name``, ``score``); of several faces the first
-    counts, a frame without one is NaN, and without times there are 30 frames a second, with a ``UserWarning``.
+    printed in Python or JavaScript, or a face's categories alone (``category_name``, ``score``); of several faces the
+    first counts, a frame without one is NaN, and without times there are 30 frames a second, with a ``UserWarning``.
 
     Returns:
         weights (T,N,1), names as the file spells them, such as Audio2Face's 52 and 16 of the tongue; rotations in
@@ -59,7 +59,7 @@ def load_weight_json(path: str | Path) -> Take:
     if isinstance(document.found, dict) and "weightMat" in document.found:
         return _audio2face(document)
     frames = document["frames"] if isinstance(document.found, dict) else document
-    if isinstance(document.found, dict) and not frames:
+    if (isinstance(document.found, dict) and not frames) or _is_face(frames.found):
         frames = replace(document, found=[document.found])
     if isinstance(frames.found, list) and any(map(_are_categories, frames.found)):
         return _mediapipe(frames)
@@ -79,7 +79,7 @@ def _categories(frame: object) -> list[dict[str, Any]] | None:
     while True:
         if isinstance(frame, dict):
             frame = next((frame[key] for key in _CATEGORIES if key in frame), None)
-        elif isinstance(frame, list) and frame and isinstance(frame[0], dict) and _score_name(frame[0]) is not None:
+        elif _is_face(frame):
             return frame
         elif isinstance(frame, list):
             if not frame:
@@ -90,7 +90,12 @@ def _categories(frame: object) -> list[dict[str, Any]] | None:
 
 
 def _are_categories(frame: object) -> bool:
-    return bool(_categories(frame))
+    return _categories(frame) is not None
+
+
+def _is_face(found: object) -> bool:
+    """Whether these are one face's categories."""
+    return isinstance(found, list) and bool(found) and isinstance(found[0], dict) and _score_name(found[0]) is not None
 
 
 def _score_name(category: dict[str, Any]) -> str | None:
@@ -117,6 +122,10 @@ def _mediapipe(frames: Value) -> Take:
                 seen.add(column)
     if any(isinstance(row.found, dict) and any(map(row.found.get, _MATRICES)) for row in rows):
         warnings.warn(f"{frames.source}: the head's motion (facial transformation matrices) is not read", stacklevel=4)
+    if not seen:
+        empty = not any(_categories(row.found) for row in rows)
+        found = f"no face in any of {len(rows)} frames" if empty else f"no category but {_NEUTRAL}"
+        raise FileFormatError(f"{frames.source}: found {found}, expected MediaPipe's categories by ARKit's names")
     known = sorted(seen)
     key = next((key for key in _TIMES if isinstance(rows[0].found, dict) and key in rows[0].found), None)
     if key is None:
