@@ -342,7 +342,7 @@ def test_attach_cleans_takes_slip_out_and_refuses_markers_off_the_skin(
     run("attach", shoot / "rig.glb", shoot / "dirty.c3d", *common)
     told = " ".join(capsys.readouterr().err.split())
     assert "helmet or head: moved by up to" in told
-    assert "cleanup: swap: 1" in told
+    assert "cleanup: 1 swap" in told
     off = site_distances(dome_rig, Attachment.load(out), true)
     assert off.median() < 0.5
     out.unlink()

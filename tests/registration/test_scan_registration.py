@@ -138,7 +138,7 @@ def test_the_same_input_gives_the_same_result(
     assert torch.equal(again.mesh.vertices, registered.mesh.vertices)
     assert again.record == registered.record
     assert sum("bending" in line for line in lines) == len(again.record.stages)
-    assert lines[0] == "checking the scan"
+    assert lines[0] == "checking the head"
 
 
 @pytest.mark.bench

@@ -34,7 +34,7 @@ def test_people_go_before_performers_and_models_with_a_rig_before_others(
     zoo.save_model(HeadModel.on(template.neutral, shape, rig=template), tmp_path / "more", made_up)
     chosen = NamedHeads.of(None)
     assert chosen.name == "people"
-    assert chosen.line == "head model: people, 3 people; another with --model"
+    assert chosen.line == "head model: people, 3 people; choose another with --model"
     assert NamedHeads.of("head") == NamedHeads("head")
 
 

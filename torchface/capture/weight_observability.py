@@ -65,7 +65,7 @@ class Observability:
         clear = self.shapes - len({*self.unseen, *self.ambiguous})
         lines = [
             f"the {self.points} show {clear} of the {self.shapes} shapes clearly; {len(self.unseen)} they do not see, "
-            f"{len(self.ambiguous)} look to them like others: a solve brings those to rest or mixes them",
+            f"{len(self.ambiguous)} look to them like others: their curves are not reliable",
             f"{self.count} {self.points} see {self.visible} of {self.shapes} directions of the weights above "
             f"{self.noise:g} {self.unit}; rank {self.rank}, condition {self.condition:.3g}",
         ]

@@ -86,8 +86,8 @@ GROUPS = {
         EXPORTS,
     ),
     "zoo": Group(
-        "List the learned models there are and whether they are whole: `torchface zoo --help`.",
-        "What learned models there are, what is known of them, and whether they are whole.",
+        "List the learned models there are and whether they are undamaged: `torchface zoo --help`.",
+        "What learned models there are, what is known of them, and whether they are undamaged.",
         ZOO,
     ),
 }

@@ -228,7 +228,7 @@ def export_app(
 ) -> None:
     """Write the app in the browser: a folder that any static host serves, in which a webcam moves a character.
 
-    Everything runs on the user's machine; the page sends nothing. To try it: `python -m http.server --directory OUT`,
+    Everything runs on the user's machine; the page sends nothing. To try it: `python3 -m http.server --directory OUT`,
     then open http://localhost:8000. Elsewhere a camera needs https. Where the page is not part of this installation, it
     is built once, which takes Node with npm and the network.
 
@@ -244,7 +244,7 @@ def export_app(
     print_table(report.rows())
     if report.still:
         console.print(f"no face moves {', '.join(report.still)}", soft_wrap=True)
-    console.print(f"to try it: python -m http.server --directory {out}, then http://localhost:8000", soft_wrap=True)
+    console.print(f"to try it: python3 -m http.server --directory {out}, then http://localhost:8000", soft_wrap=True)
     print_path(out)
 
 

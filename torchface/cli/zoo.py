@@ -1,4 +1,4 @@
-"""``torchface zoo``: what learned models there are, what is known of them, and whether they are whole."""
+"""``torchface zoo``: what learned models there are, what is known of them, and whether they are undamaged."""
 
 from collections.abc import Callable
 from typing import Annotated

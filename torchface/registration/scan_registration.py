@@ -139,9 +139,9 @@ def register(
         raise ShapeError(f"texture_size: found {texture_size}, expected 0 to 16384")
     check_template(template)
     shape = None if model is None else shape_model(model, template)
-    progress("checking the scan")
+    progress("checking the head")
     prepared = prepare_scan(scan, template)
-    progress("laying the template on the scan")
+    progress("placing the template on the head")
     schedule = schedule or DEFAULT_SCHEDULE
     start = start_on_scan(template, scan, prepared, landmarks, detector, schedule)
     aligned = start.pose.apply(template.vertices.detach().cpu().double())[0]
@@ -171,7 +171,7 @@ def register(
         )
     unseen = ~cover.features & ~matched
     if unseen.any():
-        progress("completing what the scan does not show")
+        progress("completing missing parts")
         nearest, unseen = _completed(deformer, template, start.surface, nearest, unseen, cover)
         matched &= ~unseen
     mesh = replace(template, vertices=deformer.current.to(template.vertices), colors=None, texture=None)
@@ -184,7 +184,7 @@ def register(
         )
     colors = _scan_colors(scan, start.prepared)
     if colors is not None:
-        progress("resampling the scan's colours")
+        progress("resampling the colours")
         mesh = _colored(mesh, template, colors, nearest, matched, unseen, texture_size)
     record = RegistrationRecord(
         start.by,

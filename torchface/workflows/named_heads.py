@@ -51,7 +51,7 @@ class NamedHeads:
             return "rig" in one.config, one.metrics.get("shape components", 0.0)
 
         best = max(people, key=worth)
-        return NamedHeads(best.name, f"head model: {best.name}, {best.data.rstrip('.')}; another with --model")
+        return NamedHeads(best.name, f"head model: {best.name}, {best.data.rstrip('.')}; choose another with --model")
 
 
 def load_head_model(name_or_path: str | Path) -> HeadModel:

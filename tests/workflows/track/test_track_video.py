@@ -79,7 +79,7 @@ def test_the_report_shows_frames_and_curves(done: Done, tmp_path: Path) -> None:
     for picture in ("frames.png", "landmarks.png", "error.png", "pose.png", "weights1.png"):
         assert picture in page
         assert (tmp_path / picture).is_file()
-    assert "as given, 0.10 px from what it was fitted to" in page
+    assert "from camera.toml, 0.10 px off when it was made" in page
     assert "frames with a face" in page
     assert '<video src="overlay.mp4"' in page
     assert "landmark_network" in page

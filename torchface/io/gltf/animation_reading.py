@@ -92,9 +92,7 @@ def read_gltf_weights(path: str | Path) -> Take | None:
         meshes |= moved
     if left_out:
         listed = ", ".join(dict.fromkeys(left_out[:5]))
-        warnings.warn(
-            f"{path}: left out: animations of other times or of the same mesh: {visible(listed)}", stacklevel=2
-        )
+        warnings.warn(f"{path}: left out: the character's other animations: {visible(listed)}", stacklevel=2)
     location = f"animations[{first}]"
     if times is None or not any(set(moving.names) - followers for moving in curves):
         return None

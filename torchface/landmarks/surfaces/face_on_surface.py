@@ -230,8 +230,8 @@ class FaceSearch:
         if not (presence >= _PRESENCE and misfit <= _MISFIT):
             raise NoFaceOnSurfaceError(
                 f"found what looks like a face from afar but not from near: presence {presence:.2f} (expected at least "
-                f"{_PRESENCE:g}), its points {misfit:.2f} distances of the eyes from a head's (expected at most "
-                f"{_MISFIT:g})",
+                f"{_PRESENCE:g}), its landmarks lie {misfit:.0%} of the eyes' distance from a head's (expected at most "
+                f"{_MISFIT:.0%})",
                 views,
                 first.score if presence >= _PRESENCE else 0.0,
             )

@@ -163,7 +163,7 @@ def fit_images(
     progress("fitting identity and expression")
     problem, state = solve_either(problem, initial)
     for number in range(settings.transfers):
-        progress("transferring the shapes that show", number, settings.transfers)
+        progress("copying the template's expressions to the head", number, settings.transfers)
         weights = problem.weights(state.coefficients).float().amax(0)
         rest = mean + torch.tensordot(state.coefficients[: len(modes)].float(), modes, dims=1)
         deltas = _personal(rig, deltas, weights, vertices, rest)

@@ -85,7 +85,7 @@ class ShapeTransfer:
         for group in self.groups():  # a loop over factorisations: shapes that move other vertices need another
             moved[group] = self._solve(group, moved)
             done += len(group)
-            progress("transferring shapes", done, len(moved))
+            progress("copying the template's expressions to the head", done, len(moved))
         return moved
 
     def follower(self, shape: int) -> "Follower":
@@ -118,7 +118,7 @@ class ShapeTransfer:
         for i, delta in enumerate(added):  # each moves other vertices, hence is a system of its own
             pose = self.rest + torch.tensordot(weights[i], self.deltas, 1) + torch.tensordot(on[i], added, 1) - delta
             moved[i] = self._added(pose, delta)
-            progress("transferring correctives", i + 1, len(added))
+            progress("copying the template's correctives to the head", i + 1, len(added))
         return correctives.with_deltas(moved)
 
     def rig(

@@ -186,7 +186,7 @@ def go_live(
         if is_source(settings.camera):
             source = received = ReceivedSource(settings.camera, every)
         else:  # what is missing should be said before models are read
-            progress("opening the camera")
+            progress("opening the camera" if settings.camera.isdigit() else "opening the film")
             source = open_source(settings.camera, notes, SourceSettings(settings.size, every, settings.loop))
         stack.enter_context(closing(source))
         with ThreadPoolExecutor(1) as beside:

@@ -79,7 +79,7 @@ class LiveReport:
             f"{figures.frames} frames solved in {figures.seconds:.1f} s, a face in {figures.found}; they came at "
             f"{figures.fps:.1f} a second",
             f"{figures.latency(0.5):.1f} ms from frame to packet (99th percentile {figures.latency(0.99):.1f} ms), "
-            f"{self.dropped} frames came while another was solved and were left out",
+            f"{self.dropped} frames were dropped, as they came while another was solved",
             *(["warning: no face was found, so nothing has moved: weights and head stayed at rest"] if none else []),
             *warnings,
         ]

@@ -114,7 +114,7 @@ class CharacterJob:
         where = f"bone {character.head_bone!r} and " if character.head is not None else ""
         lines = [
             f"face: found by {where}{len(found.views)} views in {seconds[0]:.1f} s; presence {found.presence:.2f}, "
-            f"its points {found.misfit:.2f} distances of the eyes from a head's"
+            f"its landmarks lie {found.misfit:.0%} of the eyes' distance from a head's"
         ]
         if len(found.others):
             lines.append(

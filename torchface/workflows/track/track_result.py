@@ -85,6 +85,13 @@ class Tracked:
         return self.inputs.calibration
 
     @property
+    def camera_source(self) -> str:
+        """What a measured camera is from, and its error."""
+        file = self.inputs.settings.camera or self.inputs.settings.cameras
+        found = "as given" if file is None else f"from {file.name}"
+        return f"{found}, {self.calibration.error:.2f} px off when it was made"
+
+    @property
     def finder(self) -> str:
         """What found the landmarks, by its name."""
         return Path(self.inputs.settings.landmarks).name
@@ -230,7 +237,7 @@ class Tracked:
                 "(torchface calibrate measures it)"
             )
         else:
-            lines.append(f"camera: as given, {self.calibration.error:.2f} px from what it was fitted to")
+            lines.append(f"camera: {self.camera_source}")
         lines.extend(self.cameras)
         if self.faces > 1:
             lines.append(f"{self.faces} faces in the first frame; --face N picks another than the one followed")
@@ -266,16 +273,17 @@ class Tracked:
             side, up = self.eyes.straight.mean(0).rad2deg().tolist()
             if max(abs(side), abs(up)) >= _OWN_EYES:
                 lines.append(
-                    f"eyes: of a gaze that lasts, {abs(up):.0f} degrees {'up' if up > 0 else 'down'} and "
-                    f"{abs(side):.0f} to the {'left' if side > 0 else 'right'} were taken for how this person's eyes "
-                    "lie, not for acting"
+                    f"eyes: {abs(up):.0f} degrees {'up' if up > 0 else 'down'} and {abs(side):.0f} to the "
+                    f"{'left' if side > 0 else 'right'} of a constant gaze were taken for the usual place of this "
+                    "person's eyes, not for acting"
                 )
         often = [i for i in bounds.argsort(descending=True).tolist() if bounds[i] > _OFTEN]
         if often:
             named = ", ".join(f"{self.rig.names[i]} {100 * float(bounds[i]):.0f} %" for i in often[:_MAX_NAMED])
             lines.append(
-                f"often at 1, their most: {named} of the frames; the face goes further than these shapes of the rig, "
-                "or the rig is not this person's"
+                f"often at their maximum, 1: {named} of the frames; the face goes further than these shapes of the "
+                "rig, or the rig is not this person's; a photograph of this expression in torchface fit shows the rig "
+                "more"
             )
         if unlearned := self.inputs.models.unlearned:
             more = f" and {len(unlearned) - _MAX_NAMED} more" if len(unlearned) > _MAX_NAMED else ""

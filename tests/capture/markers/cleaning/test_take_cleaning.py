@@ -132,7 +132,7 @@ def test_each_defect_is_named_with_its_frames(performance: Performance, stage_sp
     assert not cleanup.masked[:, other].any()
     # Where the drift begins a single frame may stick out.
     assert {labels for kind, labels in found if kind == "spike"} <= {("M011",), ("M021",)}
-    assert cleanup.summary().startswith("swap: 1, ")
+    assert cleanup.summary().startswith("1 swap, ")
     assert ("swap", "M041 ↔ M042", "150–189") in [row[:3] for row in cleanup.table()]
     assert all(row[0] != "gap" for row in cleanup.table(gaps=False))
 

@@ -86,9 +86,12 @@ class Cleanup:
     def summary(self) -> str:
         """How many of each."""
         counts = Counter(defect.kind for defect in self.defects)
-        found = ", ".join(f"{kind}: {counts[kind]}" for kind in _BY_SEVERITY if counts[kind])
+        words = {"displaced": "displacement"}
+        found = ", ".join(
+            f"{counts[kind]} {words.get(kind, kind)}{'s' * (counts[kind] > 1)}" for kind in _BY_SEVERITY if counts[kind]
+        )
         share = 100 * float(self.masked.double().mean()) if self.masked.numel() else 0.0
-        return f"{found or 'nothing wrong'}; {share:.2f} % of the samples masked"
+        return f"{found or 'nothing wrong'} found; {share:.2f} % of the samples rejected"
 
 
 def clean_take(solver: MarkerSolver, take: Take, slip: bool = False) -> Cleanup:
