@@ -11,10 +11,13 @@ from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import MarkerSolver, align_take, fit_attachment, rest_residual
 from torchface.capture.markers.attachment.best_sites import PathMoments, best_sites
 from torchface.capture.markers.attachment.initial_sites import sites_by_shape
+from torchface.capture.markers.helmet_motion import HelmetMotion
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
 from torchface.errors import AlignmentError, NameMismatchError, TopologyError, ValueRangeError
+from torchface.geometry.rotations import rotation_matrix, rotation_vector
 from torchface.geometry.similarity import Similarity
-from torchface.synthetic.stages.marker_stage import StageFlaws, record
+from torchface.synthetic import performer
+from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 
 Performance = tuple[BlendshapeRig, Attachment, list[Tensor]]
 
@@ -158,3 +161,23 @@ def test_the_first_guess_is_found_by_shape(performance: Performance, stage_space
         sites_by_shape(rig, scattered)
     assert "register" not in str(refused.value)
     assert "landmarks" not in str(refused.value)
+
+
+def test_the_motion_of_a_slipping_helmet_is_the_one_that_moved_the_markers() -> None:
+    rig = performer(texture=False).select(["jawOpen", "mouthPucker", "mouthSmileLeft", "mouthSmileRight"])
+    sites = place_markers(rig, 40)
+    weights = torch.rand(60, len(rig.names), generator=torch.Generator().manual_seed(0)).square()
+    take = record(rig, sites, weights, torch.Generator().manual_seed(0), StageFlaws(noise=0.1)).take
+    phase = torch.arange(len(take)) / 10
+    turn = rotation_matrix(0.12 * torch.stack([0.3 * phase.sin(), phase.cos(), 0 * phase], 1))
+    way = 8 * torch.stack([phase.sin(), 0 * phase, phase.cos()], 1)
+    planted = HelmetMotion(turn, way, sites.on(rig.neutral.faces, rig.vertices).mean(0))
+    slid = replace(take, markers=Track(take.markers.names, planted.apply(take.markers.values)))
+    fit = fit_attachment(rig, slid, sites, insist=True)
+    on_face = sites.on(rig.neutral.faces, rig(weights))
+    undone = fit.motion.undo(fit.alignment.apply(slid.markers.values.double()))
+    assert (undone - on_face).norm(dim=-1).median() < 0.3
+    # Both are relative to some pose of the helmet.
+    steps = fit.motion.rotation.float() @ fit.motion.rotation[0].T.float()
+    angles = rotation_vector(steps @ (turn @ turn[0].T).transpose(1, 2)).norm(dim=1)
+    assert torch.rad2deg(angles).max() < 0.5

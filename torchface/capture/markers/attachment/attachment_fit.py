@@ -234,7 +234,7 @@ def _spread(paths: Tensor, count: int) -> Tensor:
 
 
 def _helmet_motion(steady: Similarity, pose: Similarity, shown: Tensor, pivot: Tensor) -> HelmetMotion:
-    """The difference between a pose a frame and one for all: points were seen at R (p - c) + c + t."""
+    """The difference between one pose for all, (1,), and one a frame, (T,): points were seen at R (p - c) + c + t."""
     rotation = torch.eye(3, dtype=pivot.dtype).repeat(len(shown), 1, 1)
     translation = pivot.new_zeros(len(shown), 3)
     rotation[shown] = steady.rotation @ pose.rotation.transpose(1, 2)
