@@ -2,6 +2,8 @@
 
 from collections.abc import Iterator
 from pathlib import Path
+from shlex import quote
+from tempfile import TemporaryFile
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +14,8 @@ if TYPE_CHECKING:
     from av.audio.stream import AudioStream
     from av.container import InputContainer, OutputContainer
     from av.packet import Packet
+
+_ASTRAY = 0.03  # seconds between pictures and sound that nobody notices
 
 
 def sound_codec(film: Path) -> str:
@@ -26,9 +30,14 @@ def sound_line(film: Path, written: Path) -> list[str]:
     codec = sound_codec(film)
     if not codec or sound_codec(written):
         return []
+    with open_container(film) as (container, _):
+        seconds = _first_frame(film) - (container.start_time or 0) / pyav().time_base
+    sought = f"-ss {seconds:.3f} " if seconds > _ASTRAY else ""  # FFmpeg counts from where the first stream begins
+    named, source = quote(str(written)), quote(str(film))
+    made = quote(str(written.with_name(f"{written.stem}_sound{written.suffix}")))
     return [
-        f"sound: {written.suffix} cannot hold {film.name}'s ({codec}), it is left out; to add it anew coded: "
-        f"ffmpeg -i {written.name} -i {film.name} -map 0:v -map 1:a -c:v copy {written.stem}_sound{written.suffix}"
+        f"sound: {written.suffix} cannot hold {film.name}'s ({codec}) as it is, it is left out; to add it anew coded: "
+        f"ffmpeg -i {named} {sought}-i {source} -map 0:v -map 1:a -c:v copy -af aresample=async=1:first_pts=0 {made}"
     ]
 
 
@@ -38,15 +47,41 @@ def add_sound(film: Path, target: "OutputContainer") -> Iterator[tuple[float, "P
     Each comes with the time at which it is heard, seconds from the film's first frame; what is over before that frame
     is left out.
     """
-    codec = sound_codec(film)
-    if codec not in target.supported_codecs:
-        return iter(())
-    seconds = read_packets(film).seconds
-    begin = float(seconds[0]) if len(seconds) and np.isfinite(seconds[0]) else 0.0
+    return _added(film, target) if _can_hold(film, target) else iter(())
+
+
+def _can_hold(film: Path, target: "OutputContainer") -> bool:
+    """Whether a film's sound can be written into a file as the target, at its times: writes it into one without a name.
+
+    A codec may be held in some forms alone, and AVI holds no times: its sound begins with its pictures.
+    """
+    if sound_codec(film) not in target.supported_codecs:
+        return False
+    av, name, last = pyav(), target.format.name, 0.0
+    try:
+        with TemporaryFile(dir=Path(target.name).parent) as file:
+            with av.open(file, "w", format=name) as tried:
+                for seconds, packet in _added(film, tried):
+                    last = seconds
+                    tried.mux(packet)
+            if name != "avi":
+                return True
+            file.seek(0)
+            with av.open(file, "r", format=name) as written:
+                times = [float(packet.pts * packet.time_base) for packet in written.demux(audio=0) if packet.size]
+            return bool(times) and abs(times[-1] - last) < _ASTRAY
+    except (av.FFmpegError, ValueError, OSError):
+        return False
+
+
+def _added(film: Path, target: "OutputContainer") -> Iterator[tuple[float, "Packet"]]:
+    begin, avi = _first_frame(film), target.format.name == "avi"
     with open_container(film) as (container, _):
         template = _sound_of(container)
         assert template is not None
         stream = target.add_stream_from_template(template)
+        if template.layout.name.endswith(" channels"):  # none is named, as in AVI: the usual one of so many
+            stream.layout = f"{template.layout.nb_channels}c"
 
     def packets() -> Iterator[tuple[float, "Packet"]]:
         with open_container(film) as (container, _):
@@ -56,11 +91,18 @@ def add_sound(film: Path, target: "OutputContainer") -> Iterator[tuple[float, "P
                 shift = round(begin / packet.time_base)
                 packet.pts -= shift
                 packet.dts = packet.pts
-                if packet.pts + (packet.duration or 0) > 0:
+                # AVI would show the pictures later, by what of the sound comes before the first one.
+                if packet.pts >= 0 if avi else packet.pts + (packet.duration or 0) > 0:
                     packet.stream = stream
                     yield float(packet.pts * packet.time_base), packet
 
     return packets()
+
+
+def _first_frame(film: Path) -> float:
+    """When a film's first frame is shown, seconds; 0 where it does not say."""
+    seconds = read_packets(film).seconds
+    return float(seconds[0]) if len(seconds) and np.isfinite(seconds[0]) else 0.0
 
 
 def _sound_of(container: "InputContainer") -> "AudioStream | None":

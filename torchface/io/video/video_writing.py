@@ -48,7 +48,8 @@ def write_video(
         path: ``.avi`` and ``.mkv`` are lossless (FFV1), ``.mp4`` (H.264, or MPEG-4 where FFmpeg lacks x264) is not.
         fps: frames a second; in the mean, where there are ``times``.
         times: when each frame is shown, (T,) seconds, rising from 0; evenly if absent. ``.avi`` cannot hold them.
-        sound: a film whose sound is copied as it is; left out where the file cannot hold its codec.
+        sound: a film whose sound is copied as it is; left out where the file cannot hold it so, or not
+            at its times.
         crf: x264's number of quality, 0 to 51; 6 more halve the file.
 
     Raises:
