@@ -14,6 +14,7 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.tables.frame_rates import COMMON_RATES
+from torchface.io.video.numbered_pictures import film_of_pictures
 from torchface.io.video.video_packets import (
     frames_beside,
     is_interlaced,
@@ -206,6 +207,8 @@ def open_video(path: str | Path) -> VideoFile:
         0
     """
     path = Path(path)
+    if path.is_dir():
+        raise FileFormatError(f"{path}: found a folder, expected a video{film_of_pictures(path)}")
     packets = read_packets(path)
     with open_container(path) as (container, stream):
         rates = [float(rate) for rate in (stream.average_rate, stream.guessed_rate, stream.base_rate) if rate] or [0.0]

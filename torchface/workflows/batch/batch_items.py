@@ -11,6 +11,7 @@ from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.take_files import MARKER_ENDINGS
+from torchface.io.video.numbered_pictures import film_of_pictures
 from torchface.io.video.video_file import VIDEO_ENDINGS
 
 if TYPE_CHECKING:
@@ -113,7 +114,8 @@ def find_items(inputs: Sequence[str | Path], kind: ItemKind) -> FoundItems:
         expected = f"expected {kind.noun}s ({', '.join(kind.endings)})"
         if not inside:
             found_instead = f" but {others}" if others else ""
-            raise FileFormatError(f"{given}: found no {kind.noun} in the folder{found_instead}, {expected}")
+            hint = film_of_pictures(given) if kind.endings == VIDEO_ENDINGS else ""
+            raise FileFormatError(f"{given}: found no {kind.noun} in the folder{found_instead}, {expected}{hint}")
         if others:
             left_out.append(f"{given}: left out {others}, {expected}")
         files |= dict.fromkeys(path.resolve() for path in inside)
