@@ -144,6 +144,20 @@ def test_somebody_else_is_found_at_once_after_a_cut(face: Tensor, elsewhere: tup
     assert tracker.step(stage.frame(elsewhere)).found
 
 
+@pytest.mark.parametrize("followed", [0, 1])
+def test_a_person_is_found_again_after_a_cut_to_that_person_alone(face: Tensor, followed: int) -> None:
+    colours = [(200, 120, 90), (70, 90, 180)]
+    for elsewhere in ((200.0, 110.0), (60.0, 60.0), (330.0, 140.0)):
+        stage = Stage(face, colours)
+        tracker = LandmarkTracker(stage.find, detector=stage.detect, face=followed)
+        for _ in range(4):
+            found = tracker.step(stage.frame((90.0, 100.0), (310.0, 100.0)))
+        person = int(found.landmarks[:, 0].mean() > 200)
+        assert person == followed
+        stage.colours = [colours[person]]
+        assert all(tracker.step(stage.frame(elsewhere)).found for _ in range(30)), elsewhere
+
+
 @pytest.mark.parametrize("fps", [15.0, 30.0, 60.0])
 def test_who_stood_there_already_is_not_taken_for_one_who_is_hidden_for_a_moment(face: Tensor, fps: float) -> None:
     stage = Stage(face, [(200, 120, 90), (70, 90, 180)])

@@ -263,15 +263,15 @@ class LandmarkTracker:
                 return own
         known, waits = known_look(self._followed.people), self._waits()
         hidden = waits and not self._followed.cut and bool(is_beside(self._followed.people))
-        if hidden or self.face >= len(faces):
+        skipped = 0 if known.any() else self.face  # who is known is chosen by the look
+        if hidden or skipped >= len(faces):
             return None
         shown = self._shown(frame, faces)
         if known.any():
             looks = [float(known @ look_at(frame, self._place(face.landmarks), LOOK_SIZE)) for face in shown]
             alike = sorted(zip(looks, shown, strict=True), key=lambda one: -one[0])
             shown = [face for look, face in alike if not waits or self._came(frame, face, look)]
-        else:
-            shown = shown[self.face :]
+        shown = shown[skipped:]
         if waits and shown:
             self._followed.forget_place()
         return next((face for face in shown if self._is_person(frame, face)), None)
