@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.anybody.webcam_state import WebcamState
-from torchface.capture.own_rig.eye_geometry import SURELY_OPEN, SURELY_SHUT, judged_openness, look_weights
+from torchface.capture.own_rig.eye_geometry import SURELY_OPEN, SURELY_SHUT, judged_openness, look_weights, shown_iris
 
 _STRAYS = 0.35  # radians: what is further to the side or up is no looking straight ahead
 _SHUT = 0.05
@@ -72,9 +72,12 @@ def eye_signals(
     visible = torch.where(torch.isnan(visibility), 1.0, visibility).clamp(0, 1)
     resting, shutting = (pose - 1).abs() < 0.5, (pose - 5).abs() < 0.5
 
+    level, floor = usual + before.lids[:, 0], _SHUT + before.lids[:, 1]
+    span = (level - floor).clamp(min=0.03)
+    part = (opening - floor) / span
     looks = ~torch.isnan(gaze).any(1)
     seen = torch.where(looks[:, None], gaze, 0.0)
-    gaze_trust = looks * visible * (1 - shut)
+    gaze_trust = looks * visible * (1 - shut) * shown_iris(part)
     counted = interval * torch.where(resting, _ASKED, 1.0)
     patience = counted / (before.straight_seen + _STRAIGHT_PRIOR + counted)
     rate = (learns * gaze_trust * patience.clamp(max=1.0))[:, None]
@@ -89,10 +92,7 @@ def eye_signals(
     ahead = ((share[:, None] * ahead).sum(0) / share.sum()).expand(2, 2)
     any_gaze = gaze_trust.max().expand(2)
 
-    level, floor = usual + before.lids[:, 0], _SHUT + before.lids[:, 1]
-    span = (level - floor).clamp(min=0.03)
     by_look = 1 + looking @ look_weights(ahead) * any_gaze
-    part = (opening - floor) / span
     rested = floor + (opening - floor) / by_look.clamp(min=0.4)
     # Narrow eyes stay so, blinks do not: what is far below the level counts, and moves it slowly.
     counts = learns * known * visible * (shut < SURELY_OPEN) * (part > _NARROWEST) * ~shutting

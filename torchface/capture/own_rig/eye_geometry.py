@@ -29,6 +29,7 @@ SURELY_OPEN, SURELY_SHUT = 0.3, 0.9
 _LEAST_OPEN = 0.15  # of an eye that is surely not shut
 _ASYMMETRY = 0.2  # how much a difference of two eyes counts that is no wink
 _DRIFT = 0.2  # of the iris's way to the side, by which a network's corners of the eye follow it
+_IRIS_SHOWS = (0.1, 0.35)  # openness, 0 shut and 1 as at rest, from which an iris begins to count, and counts fully
 _UNSEEN = 0.3  # of an eye that is hidden, its twin's openness counts for less
 
 
@@ -152,6 +153,13 @@ def undrifted(rays: Tensor, iris: Tensor) -> Tensor:
     along = torch.stack([rays[..., b, :] - rays[..., a, :] for a, b in CORNERS], dim=-2)
     share = ((iris - middle) * along).sum(-1, keepdim=True) / along.square().sum(-1, keepdim=True).clamp(min=1e-12)
     return iris + _DRIFT / (1 - _DRIFT) * share * along
+
+
+def shown_iris(part: Tensor) -> Tensor:
+    """How much of an iris is seen, in [0,1], of an eye that is open by a part, 0 shut and 1 as at rest: lids that close
+    leave a network to guess it, somewhere between them."""
+    low, high = _IRIS_SHOWS
+    return ((part - low) / (high - low)).clamp(0, 1)
 
 
 def look_weights(gaze: Tensor, turns: Tensor | None = None) -> Tensor:

@@ -19,6 +19,7 @@ from torchface.capture.own_rig.eye_geometry import (
     openness_of,
     openness_rows,
     seen_gaze,
+    shown_iris,
 )
 from torchface.capture.weight_readings import WeightReadings
 from torchface.landmarks.images.face_reading import FaceReading
@@ -125,13 +126,14 @@ def take_eyes(
     closed, seen = reading.closed.double(), reading.eye_visibility.double().clamp(0, 1)
     shut = closed.nan_to_num(0.0)
     raw = seen_gaze(rays.double(), iris.double(), rotation.double(), depth.double(), eyeballs)
-    looks = torch.isfinite(raw).all(-1)
-    trust = torch.where(looks, seen * (1 - shut), 0.0)
+    looks, openness = torch.isfinite(raw).all(-1), reading.openness.double()
+    usual = torch.where(shut < SURELY_OPEN, openness, torch.nan).nanmedian(0).values
+    part = (openness - _USUAL_SHUT) / (usual - _USUAL_SHUT).clamp(min=_LEAST_SPAN)
+    trust = torch.where(looks, seen * (1 - shut) * shown_iris(part.nan_to_num(1.0)), 0.0)
     raw = torch.where(looks[..., None], raw, 0.0)
     straight = _straight(raw, trust, _toward_lens(rays.double(), rotation.double()), reading, eyeballs)
     gaze = _one_gaze(raw - straight, trust)
 
-    openness = reading.openness.double()
     known = torch.isfinite(openness)
     by_look = torch.ones_like(openness)
     if looking is not None:
