@@ -74,6 +74,17 @@ def test_action_units_of_openface_move_a_rig_and_those_without_a_shape_are_named
     torch.testing.assert_close(found, torch.tensor([[1.0, 0.6, 0.6], [0.0, 0.0, 0.0]]))
 
 
+def test_a_shape_without_motion_does_not_count_as_driven(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = performer(texture=False).select(["jawOpen", "mouthSmileLeft", "mouthPucker"])
+    deltas = rig.deltas * torch.tensor([1.0, 0.0, 1.0])[:, None, None]
+    save_rig(BlendshapeRig(rig.neutral, deltas, rig.names), tmp_path / "rig.glb")
+    save_take(Take(30.0, weights=Track(rig.names[:2], torch.ones(2, 2, 1))), tmp_path / "take.csv")
+    words = ["retarget", tmp_path / "take.csv", "--to", tmp_path / "rig.glb", "--out", tmp_path / "out.csv"]
+    main([str(word) for word in words])
+    said = " ".join(capsys.readouterr().err.split())
+    assert "1 of 3 shapes driven nothing drives mouthPucker has no motion in the target: mouthSmileLeft" in said
+
+
 def test_names_that_nothing_knows_are_refused_with_the_flags_that_map_them(tmp_path: Path) -> None:
     save_rig(performer(texture=False).select(["jawOpen"]), tmp_path / "rig.glb")
     save_take(Take(30.0, weights=Track(("にやり", "ぺろっ"), torch.ones(2, 2, 1))), tmp_path / "mmd.csv")

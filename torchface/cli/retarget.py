@@ -56,9 +56,13 @@ def retarget(
     files = WeightFiles(out, animation, live_link, reduce)
     with file_lock(out, ".csv"), progress_bars(quiet) as progress:
         done = retarget_weights(weights, to, files, from_, table, part, progress, poses)
-    driven = len(done.shapes.to_names) - len(done.shapes.undriven)
+    driven = len(done.shapes.to_names) - len(done.shapes.undriven) - len(done.still)
     console.print(f"{len(done.take)} frames; {driven} of {len(done.shapes.to_names)} shapes driven")
-    for what, names in (("nothing drives", done.shapes.undriven), ("drives nothing:", done.shapes.unused)):
+    for what, names in (
+        ("nothing drives", done.shapes.undriven),
+        ("drives nothing:", done.shapes.unused),
+        ("has no motion in the target:", done.still),
+    ):
         if names:
             more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
             console.print(f"{what} {', '.join(names[:_MAX_NAMES])}{more}", highlight=False)

@@ -43,6 +43,7 @@ class Retargeted:
     shapes: ShapeMap
     warnings: tuple[str, ...]  # what a file leaves out, what examples do not determine
     notes: tuple[str, ...] = ()  # what was learned of examples, and how many keys files have
+    still: tuple[str, ...] = ()  # shapes of the target that are driven and have no motion
 
 
 def retarget_weights(
@@ -94,7 +95,10 @@ def retarget_weights(
     moved.weights.values[faceless] = torch.nan  # of shapes that nothing drives as well
     progress("writing")
     left_out, written = write_weights(moved, files, target, to if part is None else None)
-    return Retargeted(moved, shapes, (*faults, *notes, *left_out), (*said, *written))
+    moving = target.deltas.flatten(1).any(1).tolist()
+    still = [name for name, moves in zip(target.names, moving, strict=True) if not moves]
+    still = [name for name in still if name not in shapes.undriven]
+    return Retargeted(moved, shapes, (*faults, *notes, *left_out), (*said, *written), tuple(still))
 
 
 def _unmatched(weights: Track, shapes: ShapeMap, source: Path, target: Path) -> list[str]:
