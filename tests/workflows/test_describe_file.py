@@ -124,3 +124,8 @@ def test_triangles_without_area_are_counted_where_a_rig_is_described(tmp_path: P
     assert dict(describe(tmp_path / "rig.glb"))["triangles without area"] == "1 at rest, 1 in folded"
     save_rig(BlendshapeRig(Mesh(vertices[:4], faces[:2]), rig.deltas[1:, :4], ["half"]), tmp_path / "whole.glb")
     assert "triangles without area" not in dict(describe(tmp_path / "whole.glb"))
+
+
+def test_a_home_of_nobody_is_no_file() -> None:
+    with pytest.raises(FileFormatError, match=r"^~nobody-of-this-name/x\.glb: found no such file.*existing one$"):
+        describe(Path("~nobody-of-this-name/x.glb"))

@@ -30,8 +30,8 @@ def check_there(path: Path, what: str = "file") -> None:
     if not path.exists():
         # As it is typed, where a program or a page that hands it over takes no quotes and escapes away as a shell does.
         bare = re.sub(r"""\\(?=[ ()&'"])""", "", str(path).strip()).strip("'\"").removeprefix("file:")
-        meant = Path(bare).expanduser()
-        hint = f"; did you mean {quote(str(meant))}?" if meant != path and meant.exists() else ""
+        meant = Path(os.path.expanduser(bare))  # Path.expanduser refuses a user whom nobody knows
+        hint = f"; did you mean {quote(str(meant))}?" if meant != path and os.path.exists(meant) else ""
         raise FileFormatError(f"{path}: found no such {what}, expected an existing one{hint}")
 
 
