@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchface.errors import FileFormatError
+from torchface.errors import FileFormatError, ValueRangeError
 from torchface.io.video import open_video, write_video
 from torchface.io.video.film_sound import sound_codec, sound_line
 
@@ -97,6 +97,24 @@ def test_frames_are_shown_at_their_own_times(tmp_path: Path) -> None:
         torch.testing.assert_close(found, times, atol=0.001, rtol=0)
     with pytest.raises(FileFormatError, match=r"out\.avi: \.avi holds frames at an even rate alone"):
         write_video(torch.zeros(len(times), 48, 64), tmp_path / "out.avi", 20.0, times)
+
+
+@pytest.mark.parametrize(
+    ("times", "found"),
+    [
+        ([0.0, 0.1, 0.2], "found 3, expected one for each frame, which are more"),
+        ([0.0, 0.1, 0.2, 0.3, 0.4, 0.5], "found 6, expected one for each of 5 frames"),
+        ([0.0, 0.1, 0.05, 0.2, 0.3], "found 0.05 s after 0.1 s for frame 2, expected seconds that rise"),
+        ([0.0, 0.1, 0.1, 0.2, 0.3], "found 0.1 s after 0.1 s for frame 2"),
+        ([0.0, 0.03, 0.1, float("nan"), 0.3], "found nan s after 0.1 s for frame 3"),
+        ([1.0, 1.1, 1.2, 1.3, 1.4], "found 1 s for frame 0, expected seconds that rise from 0"),
+    ],
+)
+def test_times_that_are_none_of_these_frames_are_refused(times: list[float], found: str, tmp_path: Path) -> None:
+    for ending in (".mp4", ".mkv"):
+        with pytest.raises(ValueRangeError, match=f"times: {found}"):
+            write_video(torch.zeros(5, 32, 32), tmp_path / f"out{ending}", 10.0, torch.tensor(times))
+    assert not list(tmp_path.iterdir())
 
 
 def test_sound_that_a_file_cannot_hold_is_left_out_and_said(tmp_path: Path) -> None:

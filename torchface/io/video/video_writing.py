@@ -29,6 +29,7 @@ _BT709, _LIMITED = 1, 1  # H.273's numbers of matrix, primaries and transfer; FF
 _LOSSY = ("yuv420p", "yuv444p")
 _MAX_MPEG4_TICKS, _MAX_BIT_RATE = 65535, 2**30
 _TICK = Fraction(1, 60000)  # seconds in which uneven times are counted
+_MKV_TICK = Fraction(1, 1000)  # seconds in which Matroska counts
 
 
 def write_video(
@@ -55,7 +56,7 @@ def write_video(
     Raises:
         FileFormatError: another ending, or the file cannot be written or cannot hold ``times``.
         ShapeError: no frames, frames that differ in size, or grey ones among those in colour.
-        ValueRangeError: ``fps`` is no camera's.
+        ValueRangeError: ``fps`` is no camera's, or ``times`` do not rise from 0 or are not as many as the frames.
 
     Example:
         >>> noise = torch.randint(0, 256, (4, 16, 32), dtype=torch.uint8)
@@ -67,6 +68,8 @@ def write_video(
     check_rate(fps, "fps", ValueRangeError)
     if times is not None and path.suffix.lower() == ".avi":
         raise FileFormatError(f"{path}: .avi holds frames at an even rate alone, expected .mp4 or .mkv for others")
+    if times is not None:
+        _check_times(times, _MKV_TICK if path.suffix.lower() == ".mkv" else _TICK)
     single = _single(frames)
     first = next(single, None)
     if first is None:
@@ -97,6 +100,21 @@ def to_bytes(frame: Tensor) -> Tensor:
     if frame.dtype == torch.uint8:
         return frame.contiguous()
     return (frame.clamp(0, 1) * 255).round().to(torch.uint8).contiguous()
+
+
+def _check_times(times: Tensor, tick: Fraction) -> None:
+    """Refuses times (T,) that are no seconds rising from 0 by at least a tick."""
+    if times.ndim != 1:
+        raise ShapeError(f"times: found {tuple(times.shape)}, expected (T,)")
+    before = -1
+    for t, seconds in enumerate(times.tolist()):
+        now = round(seconds / tick) if math.isfinite(seconds) else before
+        if now <= before or (t == 0 and now != 0):
+            found = f"{seconds:g} s after {float(times[t - 1]):g} s" if t else f"{seconds:g} s"
+            raise ValueRangeError(
+                f"times: found {found} for frame {t}, expected seconds that rise from 0, by {float(tick):.2g} at least"
+            )
+        before = now
 
 
 def _check_written(expected: VideoFile, temporary: Path) -> None:
@@ -134,6 +152,8 @@ def _encode(
         pixels = np.ascontiguousarray(pixels if pixels.ndim == 2 else pixels.transpose(1, 2, 0))
         layout = "rgb24" if pixels.ndim == 3 else "gray"
         coded = reformatter.reformat(av.VideoFrame.from_ndarray(pixels, layout), format=stream.pix_fmt, **lossy)
+        if times is not None and count >= len(times):
+            raise ValueRangeError(f"times: found {len(times)}, expected one for each frame, which are more")
         coded.time_base = stream.codec_context.time_base
         coded.pts = count if times is None else round(float(times[count]) / coded.time_base)
         container.mux(stream.encode(coded))
@@ -141,6 +161,8 @@ def _encode(
         while heard is not None and heard[0] <= coded.pts * coded.time_base:
             container.mux(heard[1])
             heard = next(sound, None)
+    if times is not None and count < len(times):
+        raise ValueRangeError(f"times: found {len(times)}, expected one for each of {count} frames")
     container.mux(stream.encode(None))
     for _, packet in () if heard is None else chain([heard], sound):
         container.mux(packet)
