@@ -27,12 +27,18 @@ def test_the_first_python_of_the_readme_runs(tmp_path: Path, monkeypatch: pytest
     assert len(take) == 60
 
 
+@pytest.mark.parametrize(
+    ("angle", "way", "stated"), [(0.05, 4.0, True), (0.7, 300.0, True), (0.7, 300.0, False)], ids=str
+)
 def test_the_markers_for_a_graph_are_brought_into_the_rigs_space(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, angle: float, way: float, stated: bool
 ) -> None:
+    """Of a helmet that slips, and of a head that moves in the volume, whose scale may be estimated, too."""
     monkeypatch.chdir(tmp_path)
     page = README.parent / "docs" / "how_to" / "applications.md"
     (code,) = re.findall(r"```python\n(.*?)```", page.read_text(encoding="utf-8"), re.DOTALL)
+    assert ", scale=False)" in code
+    code = code if stated else code.replace(", scale=False)", ")")
     actor = performer(texture=False).select(["jawOpen", "mouthSmileLeft", "mouthSmileRight"])
     sites = Attachment.from_vertices(actor.neutral, actor.neutral.landmarks[17:])
     markers = sites.on(actor.neutral.faces, actor(torch.rand(20, 3, generator=torch.Generator().manual_seed(0))))
@@ -41,8 +47,8 @@ def test_the_markers_for_a_graph_are_brought_into_the_rigs_space(
     save_rig(actor, "actor.glb")
     sites.save("attachment.json")
     phase = torch.linspace(0, 6, len(markers))
-    slip = rotation_matrix(0.05 * torch.stack([phase.sin(), phase.cos(), 0 * phase], 1))
-    slid = markers @ slip.transpose(1, 2) + 4 * torch.stack([phase.sin(), 0 * phase, phase.cos()], 1)[:, None]
+    slip = rotation_matrix(angle * torch.stack([phase.sin(), phase.cos(), 0 * phase], 1))
+    slid = markers @ slip.transpose(1, 2) + way * torch.stack([phase.sin(), 0 * phase, phase.cos()], 1)[:, None]
     moved = Track([labels[i] for i in order], slid[:, order] @ turn.T + torch.tensor([90.0, -1200.0, 40.0]))
     save_take(Take(30.0, markers=moved), "take.c3d")
     exec(compile(code, str(page), "exec"), {})

@@ -10,6 +10,7 @@ from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import MarkerSolver, align_take, fit_attachment, rest_residual
 from torchface.errors import AlignmentError
 from torchface.geometry.mirrored_points import check_mirrored
+from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import Similarity
 from torchface.synthetic.stages.marker_stage import StageFlaws, record
 
@@ -50,6 +51,17 @@ def test_a_take_without_a_neutral_frame(performance: Performance, stage_space: S
     best = MarkerSolver(rig, attachment).solve_take(take).weights
     error, least = ((w.values[..., 0] - weights).abs().mean() for w in (solved, best))
     assert error < 1.25 * least
+
+
+def test_a_head_that_moves_in_the_volume_does_not_shrink(performance: Performance, stage_space: Similarity) -> None:
+    rig, attachment, takes = performance
+    take = record(rig, attachment, takes[0][::30], torch.Generator().manual_seed(0), StageFlaws(missing=0.05)).take
+    phase = torch.linspace(0, 6, len(take))
+    turned = rotation_matrix(torch.stack([0 * phase, 0.7 * phase.sin(), 0 * phase], 1))
+    walked = 300 * torch.stack([phase.sin(), 0 * phase, phase.cos()], 1)
+    values = take.markers.values @ turned.transpose(1, 2) + walked[:, None]
+    free = moved(replace(take, markers=Track(take.markers.names, values)), stage_space)
+    assert abs(float(align_take(rig, attachment, free).scale[0] * stage_space.scale) - 1) < 0.01
 
 
 def test_what_is_left_at_rest_is_told_and_subtracted(performance: Performance) -> None:

@@ -17,7 +17,7 @@ _ROUNDS, _NEAR = 4, 2.0  # millimetres: what is nearer counts in full
 _SHAPE_ROUNDS = 3
 # Of the markers' mean distance from their centre: farther no helmet slips, and expressions alone seem to move a head by
 # less than the second. In fewer frames than the last share markers are wrong.
-_SLIPS, _EXPRESSIONS, _SHARE_MOVES = 0.3, 0.2, 0.05
+_SLIPS, EXPRESSIONS, _SHARE_MOVES = 0.3, 0.2, 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +134,7 @@ def steady_take(take: Take) -> tuple[Take, HelmetMotion | None]:
     """
     assert take.markers is not None
     values = take.markers.values
-    motion = free_motion(values.double(), _EXPRESSIONS)
+    motion = free_motion(values.double(), EXPRESSIONS)
     if motion is None:
         return take, None
     return replace(take, markers=replace(take.markers, values=motion.undo(values.double()).to(values))), motion

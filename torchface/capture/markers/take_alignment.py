@@ -6,6 +6,7 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
+from torchface.capture.markers.helmet_motion import EXPRESSIONS, free_motion
 from torchface.capture.markers.marker_solver import MarkerSolver, check_labels
 from torchface.capture.markers.rest_pose import (
     check_not_collinear,
@@ -38,7 +39,8 @@ def align_take(
 
     .. math:: \min_{s,R,t,\,w} \sum_{t,m} \lVert s R y_{tm} + t - b_m - B_m w_t \rVert^2, \quad 0 \le w \le 1
 
-    Samples that stay far from their sites do not count, so exchanged labels and spikes do not move it.
+    Samples that stay far from their sites do not count, so exchanged labels and spikes do not move it. Of a head that
+    moves freely in the volume the scale is that of the markers without this motion; the rest is that of a middle pose.
 
     Args:
         rig: the performer's.
@@ -89,7 +91,13 @@ def align_take(
         return pose_of_points(frame, rest, scale)
     check_not_collinear(paths.nanmedian(0).values)
     few = paths[:: max(1, len(paths) // _FRAMES)]
-    return pose_of_take(affine, few[~torch.isnan(few).any(-1).all(1)], scale)
+    few = few[~torch.isnan(few).any(-1).all(1)]
+    motion = free_motion(few, EXPRESSIONS) if scale else None
+    if motion is None:
+        return pose_of_take(affine, few, scale)
+    # Markers that move far are nearest to sites that do not where all of them shrink to a point.
+    size = pose_of_take(affine, motion.undo(few)).scale
+    return replace(pose_of_take(affine, size * few, scale=False), scale=size)
 
 
 def rest_residual(
