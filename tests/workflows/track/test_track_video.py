@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from tests.io.video.test_film_sound import EVEN, film
 from tests.workflows.track.conftest import FRAMES, QUICK, Done, Filmed
 from torchface import BlendshapeRig, load_rig, load_take, save_rig
 from torchface.cli import main
@@ -175,6 +176,15 @@ def test_the_verdict_comes_first(done: Done) -> None:
     marks[: FRAMES // 2] = torch.nan
     half = replace(tracked, reading=replace(tracked.reading, landmarks=marks))
     assert half.verdict().startswith(f"result: partly usable, the face was found in {FRAMES - FRAMES // 2} of {FRAMES}")
+
+
+def test_sound_that_the_overlay_lacks_is_said(done: Done, tmp_path: Path) -> None:
+    tracked = done.tracked
+    spoken = film(tmp_path / "spoken.mov", "pcm_s16le", EVEN)
+    clip = replace(tracked.video, path=spoken)
+    said = replace(tracked, inputs=replace(tracked.inputs, clip=clip)).lines()
+    assert sum(line.startswith("sound: .mp4 cannot hold spoken.mov's (pcm_s16le)") for line in said) == 1
+    assert not any(line.startswith("sound:") for line in tracked.lines())
 
 
 def test_offsets_of_another_person_are_said(done: Done, filmed: Filmed, tmp_path: Path) -> None:

@@ -17,6 +17,7 @@ from torchface.capture.own_rig.take_eyes import TakeEyes
 from torchface.capture.own_rig.weight_walk import HIDDEN
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io.video import VideoFile
+from torchface.io.video.film_sound import sound_line
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.tracking.video_landmarks import landmark_jitter
 from torchface.rig import BlendshapeRig
@@ -230,6 +231,8 @@ class Tracked:
                 f"variable frame rate: {self.inputs.rate_varies}; weights.csv, animation.glb and the overlay have the "
                 "frames' own times"
             )
+        if "overlay" in self.products:
+            lines.extend(sound_line(self.video.path, self.products["overlay"]))
         if self.calibration.assumed:
             lines.append(
                 f"camera: none given; assumed a field of view of {self.calibration.field_of_view:.0f} degrees "
