@@ -47,21 +47,22 @@ def add_sound(film: Path, target: "OutputContainer") -> Iterator[tuple[float, "P
     Each comes with the time at which it is heard, seconds from the film's first frame; what is over before that frame
     is left out.
     """
-    return _added(film, target) if _can_hold(film, target) else iter(())
+    if sound_codec(film) not in target.supported_codecs:
+        return iter(())
+    begin = _first_frame(film)
+    return _added(film, begin, target) if _can_hold(film, begin, target) else iter(())
 
 
-def _can_hold(film: Path, target: "OutputContainer") -> bool:
+def _can_hold(film: Path, begin: float, target: "OutputContainer") -> bool:
     """Whether a film's sound can be written into a file as the target, at its times: writes it into one without a name.
 
     A codec may be held in some forms alone, and AVI holds no times: its sound begins with its pictures.
     """
-    if sound_codec(film) not in target.supported_codecs:
-        return False
     av, name, last = pyav(), target.format.name, 0.0
     try:
         with TemporaryFile(dir=Path(target.name).parent) as file:
             with av.open(file, "w", format=name) as tried:
-                for seconds, packet in _added(film, tried):
+                for seconds, packet in _added(film, begin, tried):
                     last = seconds
                     tried.mux(packet)
             if name != "avi":
@@ -74,8 +75,8 @@ def _can_hold(film: Path, target: "OutputContainer") -> bool:
         return False
 
 
-def _added(film: Path, target: "OutputContainer") -> Iterator[tuple[float, "Packet"]]:
-    begin, avi = _first_frame(film), target.format.name == "avi"
+def _added(film: Path, begin: float, target: "OutputContainer") -> Iterator[tuple[float, "Packet"]]:
+    avi = target.format.name == "avi"
     with open_container(film) as (container, _):
         template = _sound_of(container)
         assert template is not None
