@@ -58,9 +58,9 @@ def test_markers_of_the_helmet_are_named_and_those_of_the_face_are_not(
         (*(sites.labels or ()), *names),
     )
     fit, _ = cleaned_fit(dome_rig, whole, start, standoff=False, free_scale=False)
-    assert helmet_markers(fit, whole) == names
+    assert helmet_markers(fit, whole, whole) == names
     alone, _ = cleaned_fit(dome_rig, take, sites, standoff=False, free_scale=False)
-    assert helmet_markers(alone, take) == []
+    assert helmet_markers(alone, take, take) == []
 
 
 @pytest.mark.parametrize(

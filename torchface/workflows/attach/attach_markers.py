@@ -48,6 +48,7 @@ _MAX_MASKED = 0.5
 _STANDOFF_RATIO = 0.95
 # One marker in so many may sit on the helmet.
 _MAX_HELMET = 3
+_STILL = 0.5  # of most markers' motion, as recorded, which is the head's too
 _INSIST = "--insist writes the sites all the same"
 _BY_SHAPE = (
     "found by the markers' shape alone, to which a take in left-handed axes looks the same: see on which side they lie "
@@ -149,17 +150,20 @@ def cleaned_fit(
     return fit, replace(cleanup, defects=tuple(defects))
 
 
-def helmet_markers(fit: AttachmentFit, take: Take) -> list[str]:
+def helmet_markers(fit: AttachmentFit, steady: Take, recorded: Take) -> list[str]:
     """The labels of markers that stay far from the skin and move no more than most of the others: the helmet's.
 
-    At most a third of all: else it is the rig or the labels that are wrong.
+    They do so once the head's motion is taken out; or as recorded less than half as much, where the helmet slips and
+    stays where it is. At most a third of all: else it is the rig or the labels that are wrong.
     """
-    assert take.markers is not None
-    labels = fit.attachment.labels or ()
-    paths = take.markers.select(labels).values.double()
-    motion = (paths - paths.nanmedian(0).values).square().sum(-1).nanmean(0).sqrt()
-    on_skin = inlier_markers(fit.errors[-1])
-    far = (~on_skin & (motion <= motion[on_skin].median())).nonzero()[:, 0].tolist()
+    labels, on_skin = fit.attachment.labels or (), inlier_markers(fit.errors[-1])
+    still = torch.zeros_like(on_skin)
+    for take, share in ((steady, 1.0), (recorded, _STILL)):
+        assert take.markers is not None
+        paths = take.markers.select(labels).values.double()
+        motion = (paths - paths.nanmedian(0).values).square().sum(-1).nanmean(0).sqrt()
+        still |= motion <= share * motion[on_skin].median()
+    far = (~on_skin & still).nonzero()[:, 0].tolist()
     return [labels[m] for m in far] if _MAX_HELMET * len(far) <= len(labels) else []
 
 
@@ -228,6 +232,7 @@ def attach(
     progress("reading the range of motion")
     start = None if settings.initial is None else load_sites(settings.initial, loaded.neutral, rig)
     take, start, notes = read_range_of_motion(rom, start, settings.options)
+    recorded = take
     take, head = steady_take(take)
     remarks: list[str] = []
     if start is None:
@@ -243,7 +248,7 @@ def attach(
         check_not_mirrored(marker_paths(take, start), sites, str(rom), take.extras.get("flipped"))
     free_scale = settings.options.frees_scale(rom)
     fit, cleanup = cleaned_fit(loaded, take, start, settings.standoff, progress, free_scale)
-    on_helmet = helmet_markers(fit, take)
+    on_helmet = helmet_markers(fit, take, recorded)
     if on_helmet:
         names = [name for name in fit.attachment.labels or () if name not in on_helmet]
         assert take.markers is not None
