@@ -95,9 +95,8 @@ def retarget_weights(
     moved.weights.values[faceless] = torch.nan  # of shapes that nothing drives as well
     progress("writing")
     left_out, written = write_weights(moved, files, target, to if part is None else None)
-    moving = target.deltas.flatten(1).any(1).tolist()
-    still = [name for name, moves in zip(target.names, moving, strict=True) if not moves]
-    still = [name for name in still if name not in shapes.undriven]
+    unmoved = (~target.deltas.flatten(1).any(1)).nonzero()[:, 0].tolist()
+    still = [target.names[row] for row in unmoved if target.names[row] not in shapes.undriven]
     return Retargeted(moved, shapes, (*faults, *notes, *left_out), (*said, *written), tuple(still))
 
 

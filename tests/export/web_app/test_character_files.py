@@ -25,6 +25,7 @@ from torchface.io.gltf.performance_animation import Performance, performed_glb
 from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.protocols.vmc_packets import VmcPackets
 from torchface.io.weights.weight_csv import save_weights_csv
+from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, VRM1, mapping
 from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.head_rotations import head_angles
@@ -391,3 +392,11 @@ def test_shapes_that_would_fill_the_memory_are_refused(run: Run, tmp_path: Path)
     mesh = {"primitives": [{"targets": [{"POSITION": 0}] * 60}], "extras": {"targetNames": ["jawOpen"] * 60}}
     path = document(tmp_path / "file.glb", meshes=[mesh], accessors=[{"count": 10**6}])
     assert "too large" in run("refusal", path)
+
+
+def test_shapes_that_move_nothing_are_named(tmp_path: Path) -> None:
+    rig = load_rig(sheet(tmp_path / "all.glb", ("jawOpen", "mouthPucker", "tongueOut")))
+    assert load_character(tmp_path / "all.glb").still == ()
+    deltas = rig.deltas * torch.tensor([1.0, 1.0, 0.0])[:, None, None]
+    save_rig(BlendshapeRig(rig.neutral, deltas, rig.names), tmp_path / "two.glb")
+    assert load_character(tmp_path / "two.glb").still == ("tongueOut",)

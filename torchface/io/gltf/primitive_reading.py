@@ -215,6 +215,21 @@ def read_target_names(document: Document, index: int) -> tuple[str, ...]:
     return _target_names(document, mesh, location, len(targets[0]) if targets else 0)
 
 
+def moving_target_names(document: Document, index: int) -> frozenset[str]:
+    """Of the morph targets of mesh ``index`` those that move a vertex, by the bounds that glTF demands of positions;
+    those without bounds count."""
+    location, moving = f"meshes[{index}]", set()
+    for row in document.array(document.item("meshes", index, location), "primitives", location):
+        targets = document.array(document.record(row, location), "targets", location)
+        for name, target in zip(read_target_names(document, index), targets, strict=False):
+            positions = document.record(target, location).get("POSITION")
+            bounds = {} if positions is None else document.item("accessors", positions, location)
+            ways = [document.numbers(bounds, key, location, 3) for key in ("min", "max")]
+            if positions is not None and any(way is None or any(way) for way in ways):
+                moving.add(name)
+    return frozenset(moving)
+
+
 def _target_names(document: Document, mesh: dict[str, Any], location: str, count: int) -> tuple[str, ...]:
     """From the mesh, as Blender and three.js have it, or its first primitive; else ``target_0`` and so on."""
     primitives = [row for row in document.array(mesh, "primitives", location) if isinstance(row, dict)]

@@ -3,7 +3,7 @@
 import warnings
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 import torch
@@ -93,7 +93,7 @@ def _are_categories(frame: object) -> bool:
     return _categories(frame) is not None
 
 
-def _is_face(found: object) -> bool:
+def _is_face(found: object) -> TypeGuard[list[dict[str, Any]]]:
     """Whether these are one face's categories."""
     return isinstance(found, list) and bool(found) and isinstance(found[0], dict) and _score_name(found[0]) is not None
 

@@ -30,7 +30,7 @@ class AppReport:
         sizes: bytes of each file by its path inside the folder.
         packed: the same as gzip has them, which is what a host that compresses sends.
         driven: the character's shapes that a face moves.
-        still: its other shapes.
+        still: its other shapes, and those that move nothing.
     """
 
     sizes: dict[str, int]
@@ -101,7 +101,7 @@ def export_app(
             if (out / former).is_file():
                 delete_file(out / former)
     packed = {name: len(gzip.compress(data, 6)) for name, data in files.items()}
-    still = shown.shapes.undriven
+    still = tuple(dict.fromkeys((*shown.shapes.undriven, *shown.still)))
     driven = tuple(name for name in shown.names if name not in still)
     return AppReport({name: len(data) for name, data in files.items()}, packed, driven, still)
 

@@ -19,7 +19,7 @@ from torchface.geometry.meshes.normal_maps import SurfaceMaps
 from torchface.io import load_rig, save_rig
 from torchface.io.gltf.corrective_extras import scene_correctives
 from torchface.io.gltf.gltf_document import Document, document_of
-from torchface.io.gltf.primitive_reading import read_target_names
+from torchface.io.gltf.primitive_reading import moving_target_names, read_target_names
 from torchface.io.tables.csv_table import quoted
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
@@ -60,6 +60,13 @@ class Character:
     def names(self) -> tuple[str, ...]:
         """Of its shapes, without correctives."""
         return self.shapes.to_names
+
+    @property
+    def still(self) -> tuple[str, ...]:
+        """Its shapes that move nothing."""
+        meshes = range(len(self.document.objects("meshes")))
+        moving = frozenset[str]().union(*(moving_target_names(self.document, i) for i in meshes))
+        return tuple(name for name in self.names if name not in moving)
 
     def targets(self, weights: Tensor) -> tuple[tuple[str, ...], Tensor]:
         """Names and weights (T,N+C) of all morph targets for weights (T,N) of the shapes."""
