@@ -16,7 +16,7 @@ from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, spelled_as
 from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
 from torchface.take import Take, Track
-from torchface.workflows.weight_files import reduced_take, weight_faults
+from torchface.workflows.weight_files import WeightFiles, reduced_take, weight_faults, write_weights
 
 DOME = ("jawOpen", "browInnerUp", "mouthSmileLeft", "mouthSmileRight")
 OWN = ("ctrl_a", "ctrl_b", "ctrl_c", "ctrl_d")
@@ -268,3 +268,17 @@ def test_other_bounds_are_refused(bound: str, stage: Path, capsys: pytest.Captur
     assert "--reduce: found" in capsys.readouterr().err
     with pytest.raises(SystemExit):
         main(["convert", str(stage / "own.glb"), str(stage / "b.glb"), "--reduce", bound])
+
+
+def test_eyes_turn_in_live_link_as_the_weights_say(tmp_path: Path, dome_rig: BlendshapeRig) -> None:
+    """By the usual 30 degrees at weight 1, where no eyeball shows another; a take's own columns stay as they are."""
+    values = torch.zeros(2, len(ARKIT), 1)
+    values[1, ARKIT.index("eyeLookInLeft")] = 0.5
+    take = Take(30.0, weights=Track(ARKIT, values))
+    write_weights(take, WeightFiles(tmp_path / "w.csv"), dome_rig)
+    columns = load_take(tmp_path / "w.csv").extras["columns"]
+    assert float(columns["LeftEyeYaw"][1]) == pytest.approx(0.5 * 0.52, abs=1e-4)
+    assert not any(bool(columns[name].any()) for name in ROTATIONS if name != "LeftEyeYaw")
+    own = {name: torch.full((2,), 0.1).double() for name in ROTATIONS}
+    write_weights(replace(take, extras={"columns": own}), WeightFiles(tmp_path / "own.csv"), dome_rig)
+    assert torch.allclose(load_take(tmp_path / "own.csv").extras["columns"]["LeftEyeYaw"], own["LeftEyeYaw"])

@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchface.capture.own_rig.eye_geometry import Eyeballs
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder, write_file
 from torchface.io.gltf.gltf_document import read_document
@@ -24,8 +25,9 @@ from torchface.shape_names import ARKIT, mapping
 from torchface.take import Take, Track
 from torchface.temporal.interpolation import values_at
 from torchface.temporal.key_reduction import KeyReduction, kept_keys, reduction_error
+from torchface.workflows.head_rotations import still_head_columns
 
-_SHOWN = 8
+_SHOWN, _IBUG = 8, 68
 _KEPT = (".glb", ".vrm")  # rigs' files that are written again with all that they have
 _ROUNDED = 1e-3  # what a file's rounding leaves beyond 0 or 1
 
@@ -121,6 +123,18 @@ def check_live_link(names: Sequence[str], target: Path | str | None) -> None:
         )
 
 
+def _with_eyes(take: Take, rig: BlendshapeRig) -> Take:
+    """With the rotations of the eyes that its weights say, unless it comes with columns of its own."""
+    if "columns" in take.extras:
+        return take
+    assert take.weights is not None
+    notes, onto = rig.neutral.annotations, mapping(take.weights.names, ARKIT).to(take.weights.values)
+    annotated = notes is not None and notes.landmarks is not None and len(notes.landmarks) == _IBUG
+    turns = (Eyeballs.of(rig) if annotated else Eyeballs.usual()).turns
+    weights = Track(ARKIT, (take.weights.values[..., 0] @ onto.T)[..., None])
+    return replace(take, extras=take.extras | {"columns": still_head_columns(weights, turns)})
+
+
 def write_weights(
     take: Take, files: WeightFiles, rig: BlendshapeRig, source: Path | None = None
 ) -> tuple[list[str], list[str]]:
@@ -141,10 +155,13 @@ def write_weights(
         notes.append(f"{files.out}: {reduction}")
     make_folder(files.out.parent)
     with all_or_none():
-        (save_weights_csv if lost else save_live_link)(few, files.out)
+        if lost:
+            save_weights_csv(few, files.out)
+        else:
+            save_live_link(_with_eyes(few, rig), files.out)
         if files.live_link is not None:
             make_folder(files.live_link.parent)
-            save_live_link(few, files.live_link)
+            save_live_link(_with_eyes(few, rig), files.live_link)
     if lost and files.live_link is not None:
         more = f" and {len(lost) - _SHOWN} more" if len(lost) > _SHOWN else ""
         listed = ", ".join(lost[:_SHOWN]) + more

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchface.capture.markers.mesh_solver import MeshSolution, MeshSolver
-from torchface.capture.own_rig.eye_geometry import Eyeballs
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.files.documents import read_json
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder, write_file
@@ -31,7 +30,6 @@ from torchface.workflows.arkit.head_parameters import (
     save_parameters,
 )
 from torchface.workflows.arkit.moving_head import MAX_JSON, load_moving_head
-from torchface.workflows.head_rotations import still_head_columns
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig.character_face import plain_surface
 from torchface.workflows.rig.character_job import FACE_SPAN
@@ -120,8 +118,7 @@ def animation_to_weights(
     solution = solver.solve(read, moving.count, fps, settings.temporal, progress)
     broken = _broken_frames(solution, animation)
     take = Take(fps, weights=Track(rig.names, solution.weights.float()[..., None]))
-    turns = (Eyeballs.of(rig) if is_annotated(rig.neutral) else Eyeballs.usual()).turns
-    warnings, _ = write_weights(_with_eyes(_all_of_arkit(take), turns), files, rig)
+    warnings, _ = write_weights(_all_of_arkit(take), files, rig)
     error_file = out.with_name(f"{out.stem}_error.csv")
     _write_errors(solution, fps, error_file)
     lines = [
@@ -204,7 +201,7 @@ def _renamed(take: Take, path: Path, files: WeightFiles) -> list[str]:
     lost = [name for name, used in zip(take.weights.names, matrix.any(0).tolist(), strict=True) if not used]
     values = take.weights.values[..., 0] @ matrix.T
     arkit = replace(take, weights=Track(ARKIT, values[..., None]))
-    write_weights(_with_eyes(arkit, Eyeballs.usual().turns), files, _no_rig())
+    write_weights(arkit, files, _no_rig())
     left = f"; ARKit has no {', '.join(lost[:8])}" + (f" and {len(lost) - 8} more" if len(lost) > 8 else "")
     return [f"{len(take)} frames of weights by name, {take.rate}{left if lost else ''}"]
 
@@ -220,12 +217,6 @@ def _all_of_arkit(take: Take) -> Take:
     assert take.weights is not None
     matrix = mapping(take.weights.names, ARKIT).to(take.weights.values)
     return replace(take, weights=Track(ARKIT, (take.weights.values[..., 0] @ matrix.T)[..., None]))
-
-
-def _with_eyes(take: Take, turns: Tensor) -> Take:
-    """With the eyes' rotations that its weights say, unless it comes with its own columns; ``turns`` as in Eyeballs."""
-    assert take.weights is not None
-    return replace(take, extras={"columns": still_head_columns(take.weights, turns)} | take.extras)
 
 
 def _unit_factor(solver: MeshSolver, first: Tensor, path: Path) -> tuple[Tensor, list[str]]:
