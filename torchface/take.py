@@ -166,7 +166,7 @@ class Take:
         if self.seconds is None:
             return f"{self.fps:g} a second"
         longest = float(self.seconds.diff().max()) if len(self) > 1 else 0.0
-        return f"about {self.fps:.4g} a second at uneven times, up to {longest:.3g} s apart"
+        return f"about {self.fps:g} a second at uneven times, up to {longest:.3g} s apart"
 
     def __len__(self) -> int:
         for track in (self.markers, self.landmarks, self.weights, self.timecode):

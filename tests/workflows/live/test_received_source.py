@@ -23,18 +23,15 @@ from received_frames import decode_frame
 from torchface import load_take
 from torchface.capture.anybody import WebcamControls
 from torchface.cli import main
-from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.protocols.live_link_packets import LiveLinkPackets
 from torchface.io.protocols.live_link_recordings import recorded_packets
 from torchface.io.protocols.osc_messages import osc_message
 from torchface.io.protocols.received_face import ReceivedFace
 from torchface.shape_names import ARKIT
-from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.live import live_session
 from torchface.workflows.live.live_anybody import LiveSettings, go_live
-from torchface.workflows.live.live_figures import LiveFigures, LiveReport
-from torchface.workflows.live.received_source import ReceivedSolver, ReceivedSource, ReceivedWatch, own_address
-from torchface.workflows.live.recordings import Recordings
+from torchface.workflows.live.live_figures import LiveFigures
+from torchface.workflows.live.received_source import ReceivedSolver, ReceivedSource, ReceivedWatch
 from torchface.workflows.live.session_prompts import STEPS
 
 _LIMIT = 120.0  # seconds, of a session that the phone ends before
@@ -121,12 +118,9 @@ def test_an_iphones_packets_move_a_character_and_are_recorded_and_sent_on(
     assert float(sent[:, JAW].max()) > 0.9
     assert float(sent[:, [i for i in range(52) if i != JAW]].max()) == 0
     kept = load_take(tmp_path / "out" / "weights.csv").weights
-    torch.testing.assert_close(kept.select(["jawOpen"]).values[:, 0, 0], sent[-len(kept) :, JAW])  # from the first on
+    torch.testing.assert_close(kept.select(["jawOpen"]).values[:, 0, 0], sent[:, JAW])
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["source"] == f"livelink {port}"
-    assert said[0] == (
-        f"Waiting for a face at port {port} of 127.0.0.1, which no other machine reaches; for a phone, listen at "
-        f"livelink://:{port}"
-    )
+    assert said[0].startswith(f"Waiting for a face at port {port}: have the app send to ")
     assert any(words.startswith("Receiving from LLV Default Device 127.0.0.1") for words in said)
     assert "ms from frame to packet" in report.lines()[1]
 
@@ -153,7 +147,7 @@ def test_a_performance_of_an_iphone_is_recorded_and_sent_by_two_protocols_at_onc
     by_vmc, by_osc = values_by_address(vmc_packets), values_by_address(osc_packets)
     sent = torch.tensor([value for name, value in by_vmc["/VMC/Ext/Blend/Val"] if name == "jawOpen"])
     torch.testing.assert_close(sent, torch.tensor(by_osc["/face/weights/jawOpen"])[:, 0])
-    torch.testing.assert_close(sent[-len(kept) :], kept, atol=1e-5, rtol=0)
+    torch.testing.assert_close(sent, kept, atol=1e-5, rtol=0)
     # The head turns as the phone's did: of its quaternion the part about the vertical axis.
     turned = torch.tensor([values[4] for name, *values in by_vmc["/VMC/Ext/Bone/Pos"] if name == "Head"])
     yaw = take.extras["columns"]["HeadYaw"].float()
@@ -163,41 +157,7 @@ def test_a_performance_of_an_iphone_is_recorded_and_sent_by_two_protocols_at_onc
 
 def a_source() -> ReceivedSource:
     """A source that a test sets."""
-    return SimpleNamespace(face=None, fresh=False, rests=False)
-
-
-def test_a_recordings_rate_is_the_phones_in_all_files_and_in_words(dome: Path, tmp_path: Path) -> None:
-    """Ten seconds before anybody sends, and a pause of a minute, are no frames of it; nothing moves in the pause."""
-    source, figures = a_source(), LiveFigures()
-    solver, face = ReceivedSolver(source, print), torch.full((52,), 0.5)
-    recordings = Recordings(tmp_path / "out", load_character(dome), "planted", 60.0)
-    recordings.start()
-    jitter = torch.rand(1000, generator=torch.Generator().manual_seed(3)).double().numpy() / 120
-
-    def go(times: np.ndarray, fresh: bool, rests: bool = False) -> None:
-        source.face, source.fresh, source.rests = ReceivedFace(face) if fresh else source.face, fresh, rests
-        for came in times:
-            frame = solver.step(PICTURE, 1 / 60, WebcamControls())
-            figures.add(came, came + 0.001, frame.seen, frame.idle)
-            recordings.add(came, frame)
-
-    go(np.arange(50) / 5, False, rests=True)
-    go(10 + np.arange(160) / 60 + jitter[:160], True)
-    go(13 + np.arange(240) / 60, False)
-    go(17 + np.arange(300) / 5, False, rests=True)
-    go(77 + np.arange(160) / 60 + jitter[160:320], True)
-    (saved,) = recordings.finish()
-    assert saved.error == ""
-    takes = [load_take(tmp_path / "out" / name) for name in ("live_link.csv", "weights.csv")]
-    takes.append(read_gltf_weights(tmp_path / "out" / "animation.glb"))
-    assert [len(take) for take in takes] == [561] * 3
-    rates = [json.loads((tmp_path / "out" / "summary.json").read_text())["fps"], *(take.fps for take in takes)]
-    assert rates == pytest.approx([60.0] * 4, rel=0.02)
-    assert max(rates) - min(rates) < 0.001
-    assert LiveReport(figures, 0).lines()[0].endswith(f"they came at {rates[0]:.1f} a second")
-    jaw = takes[0].weights.select(["JawOpen"]).values[399:402, 0, 0]
-    assert jaw.tolist() == pytest.approx([0, 0, 0.42], abs=0.01)  # the pause ends at rest; then smoothing
-    assert takes[0].times[399:402].tolist() == pytest.approx([6.98, 66.8, 67.0], abs=0.02)
+    return SimpleNamespace(face=None, fresh=False)
 
 
 def test_what_is_lost_is_held_then_relaxes_to_rest() -> None:
@@ -229,16 +189,6 @@ def test_what_is_lost_is_held_then_relaxes_to_rest() -> None:
     assert solver.step(PICTURE, 1 / 60, WebcamControls()).weights[JAW] > 0.5
     source.face = ReceivedFace(torch.zeros(52), found=False)  # the app sees no face: held as if nothing came
     assert solver.step(PICTURE, 1 / 60, WebcamControls()).weights[JAW] > 0.5
-
-
-def test_while_nothing_comes_frames_go_on_at_the_senders_rate() -> None:
-    source, began = ReceivedSource("livelink://127.0.0.1:0"), time.perf_counter() - 2
-    source.close()
-    given = [[(began + i / 50, ReceivedFace(torch.zeros(52)))] for i in range(50)]
-    source.receiver = SimpleNamespace(faces=lambda wait: given.pop(0) if given else time.sleep(wait) or [])
-    times = [came for (came, _), _ in zip(source.frames(), range(71), strict=False)]
-    assert float(np.median(np.diff(times[50:]))) == pytest.approx(0.02, abs=1e-6)
-    assert all(later > sooner for sooner, later in pairwise(times))
 
 
 def test_smoothing_calms_what_trembles_and_follows_what_moves() -> None:
@@ -284,14 +234,9 @@ def test_the_status_line_says_who_sends_what_is_lost_and_that_it_ended() -> None
             return watch.words
 
         assert shown(None).startswith("Waiting for a face at port")
-        assert source.silence == (
-            f"nothing arrived at livelink://127.0.0.1:0, which no other machine reaches; for a phone, listen at "
-            f"livelink://:{source.receiver.port}"
-        )
         whole = [packets(torch.zeros(52), None)[0] for _ in range(6)]
         assert "1 not understood (found version 9" in shown(b"\x09" + whole[0][1:])
         assert shown(whole[0]).startswith("Receiving from iPhone 127.0.0.1")
-        assert source.silence == ""
         shown(whole[1])
         assert "2 lost" in shown(whole[4])
         source.heard -= 3.0
@@ -327,17 +272,6 @@ def test_weights_that_come_one_by_one_are_one_frame_of_a_recording() -> None:
     source.close()
     torch.testing.assert_close(source.face.weights, torch.arange(52) / 64)
     assert source.dropped == 0
-
-
-def test_a_session_that_nobody_sends_to_says_so(dome: Path, tmp_path: Path) -> None:
-    place = f"livelink://:{free_port()}"
-    settings = LiveSettings(place, dome, record=tmp_path / "out", page=False, seconds=0.3)
-    said: list[str] = []
-    report, (saved,) = go_live(settings, said.append, print, lambda progress: pytest.fail("no solver is needed"))
-    [words] = report.lines()
-    assert words.endswith(f" s nothing arrived at {place}")
-    assert saved.error == "received no face, expected one"
-    assert said[0].endswith(f": have the app send to {own_address()}")
 
 
 @pytest.mark.parametrize(

@@ -153,8 +153,7 @@ class WeightReceiver:
             )
             raise ValueRangeError(f"stream: cannot receive at {address} ({why})") from error
         self._socket.setblocking(False)
-        host, self.port = self._socket.getsockname()[:2]
-        self.host = "" if host in ("0.0.0.0", "::") else str(host)  # of this machine's addresses the one; empty: all
+        self.port: int = self._socket.getsockname()[1]
 
     def faces(self, seconds: float) -> list[tuple[float, ReceivedFace]]:
         """The faces that have come, in order, and when; waits so many seconds for the first."""

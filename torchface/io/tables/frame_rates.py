@@ -46,18 +46,6 @@ def simplest_rate(rate: float, agrees: Callable[[float], bool]) -> float:
     return next((candidate for candidate in (*usual, *fractions) if candidate > 0 and agrees(candidate)), rate)
 
 
-def measured_rate(steps: np.ndarray) -> float:
-    """Frames a second by the mean of steps (T,), seconds, that are within half of the median: gaps do not count."""
-    typical = float(np.median(steps[steps > 0]))
-    return 1 / float(steps[np.abs(steps - typical) < typical / 2].mean())
-
-
-def usual_rate(measured: float) -> float:
-    """A common rate, where a clock that is off by 0.2 % may have meant it; else the rate as measured."""
-    usual = min(COMMON_RATES, key=lambda rate: abs(rate - measured))
-    return usual if abs(measured / usual - 1) <= _NEAR else measured
-
-
 @dataclass(frozen=True)
 class FrameTimes:
     """When a file's frames are shown; ``Take.fps`` and ``Take.seconds`` of it."""
@@ -128,7 +116,7 @@ def frame_times(times: np.ndarray, source: TimeSource) -> FrameTimes:
     steps = np.diff(times)
     if source.rate is not None and np.abs(steps * source.rate - 1).min() <= _LIKE:
         return FrameTimes(source.rate, torch.from_numpy(times))
-    return FrameTimes(_checked(usual_rate(measured_rate(steps)), source), torch.from_numpy(times))
+    return FrameTimes(_checked(_rate(1.0, float(np.median(steps)), resolution, None), source), torch.from_numpy(times))
 
 
 def key_times(times: np.ndarray, error: Callable[[str, str], FileFormatError]) -> FrameTimes:

@@ -241,8 +241,7 @@ def go_live(
             raise ValueRangeError(f"{settings.camera}: found no frame, expected at least one")
         wrong = received.receiver.counts.words() if received is not None else ""
         more = (wrong, *(take.note for take in saved), *streams.notes())
-        silence = "" if received is None else received.silence
-        return LiveReport(session.figures, source.dropped, tuple(note for note in more if note), silence), saved
+        return LiveReport(session.figures, source.dropped, tuple(note for note in more if note)), saved
 
 
 def _keep_dropped(preparing: Preparing, recordings: Recordings, say: Say) -> None:

@@ -5,11 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from torchface.io.tables.frame_rates import usual_rate
-
 _LEAST, _MOST, _STEP = 0.05, 60_000.0, 1.01  # milliseconds; what is reported is within 1 %
 _BINS = math.ceil(math.log(_MOST / _LEAST) / math.log(_STEP))
-_HALF, _HALF_MORE = (round(math.log(ratio) / math.log(_STEP)) for ratio in (2.0, 1.5))  # in bins
 
 
 class LiveFigures:
@@ -18,19 +15,17 @@ class LiveFigures:
     def __init__(self) -> None:
         self.frames = self.found = 0
         self._histogram = np.zeros(_BINS + 1, np.int64)
-        self._steps = np.zeros((2, _BINS + 1))  # between frames: how many, and their sum in milliseconds
         self._first = self._last = self._came = 0.0
 
-    def add(self, came: float, gone: float, seen: bool, idle: bool = False) -> None:
-        """Counts a frame that came and was sent on at these times, in seconds; ``idle`` where nobody sent it."""
+    def add(self, came: float, gone: float, seen: bool) -> None:
+        """Counts a frame that came and was sent on at these times, in seconds."""
         self._first = self._first if self.frames else came
-        if self.frames and not idle:
-            step = 1000 * (came - self._came)
-            self._steps[:, _bin(step)] += 1, step
         self._last, self._came = gone, came
         self.frames += 1
         self.found += seen
-        self._histogram[_bin(1000 * (gone - came))] += 1
+        latency = 1000 * (gone - came)
+        step = math.log(max(latency, _LEAST) / _LEAST) / math.log(_STEP)
+        self._histogram[min(int(step), _BINS)] += 1
 
     def latency(self, quantile: float) -> float:
         """From a frame's arrival to its packets on the way, milliseconds; 0 before the first."""
@@ -46,17 +41,8 @@ class LiveFigures:
 
     @property
     def fps(self) -> float:
-        """Frames a second, those of a recording as ``measured_rate`` has it; 0 before the second."""
-        counts, sums = self._steps
-        if not counts.any():
-            return 0.0
-        middle = int(np.searchsorted(counts.cumsum(), counts.sum() / 2))
-        near = slice(max(0, middle - _HALF), middle + _HALF_MORE)
-        return usual_rate(1000 * float(counts[near].sum() / sums[near].sum()))
-
-
-def _bin(milliseconds: float) -> int:
-    return min(int(math.log(max(milliseconds, _LEAST) / _LEAST) / math.log(_STEP)), _BINS)
+        """Frames a second, from the first one's arrival to the last one's; 0 before the second."""
+        return (self.frames - 1) / max(self._came - self._first, 1e-9) if self.frames > 1 else 0.0
 
 
 @dataclass(frozen=True)
@@ -66,14 +52,10 @@ class LiveReport:
     figures: LiveFigures
     dropped: int  # frames that came while another was solved
     notes: tuple[str, ...] = ()  # what the user should know, such as receivers that were not there
-    silence: str = ""  # that nothing arrived, where an address was listened at
 
     def lines(self) -> list[str]:
         """For people to read."""
         figures = self.figures
-        warnings = [f"warning: {note}" for note in self.notes]
-        if self.silence:
-            return [f"in {figures.seconds:.1f} s {self.silence}", *warnings]
         none = figures.frames > 0 and figures.found == 0
         return [
             f"{figures.frames} frames solved in {figures.seconds:.1f} s, a face in {figures.found}; they came at "
@@ -81,5 +63,5 @@ class LiveReport:
             f"{figures.latency(0.5):.1f} ms from frame to packet (99th percentile {figures.latency(0.99):.1f} ms), "
             f"{self.dropped} frames were dropped, as they came while another was solved",
             *(["warning: no face was found, so nothing has moved: weights and head stayed at rest"] if none else []),
-            *warnings,
+            *(f"warning: {note}" for note in self.notes),
         ]

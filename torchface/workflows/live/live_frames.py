@@ -141,7 +141,6 @@ class LiveFrame:
     gaze: Tensor = field(default_factory=lambda: torch.zeros(2, 2))
     calibrated: float = 1.0  # how far the person is learned, in [0,1]
     found: bool = False  # whether a face is there, where no landmarks say so
-    idle: bool = False  # whether nobody sends, and all is at rest: no frame of a recording
     # the picture with what was solved drawn over it, uint8 (H,W,3); the page shows it in the picture's place
     drawn: np.ndarray | None = None
     # how many other people stand to the left of the face in the picture, and to the right, smoothed, (2,)

@@ -3,9 +3,7 @@
 import math
 import socket
 import time
-from collections import deque
 from collections.abc import Iterator
-from ipaddress import ip_address
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +14,6 @@ from torchface.capture.anybody import WebcamControls
 from torchface.capture.curve_calibration import CurveCalibration
 from torchface.io.protocols.received_face import ReceivedFace
 from torchface.io.protocols.weight_receiver import WeightReceiver
-from torchface.io.tables.frame_rates import measured_rate, usual_rate
 from torchface.io.video import VideoFile
 from torchface.shape_names import ARKIT
 from torchface.temporal.one_euro import OneEuroSettings, one_euro_step
@@ -26,8 +23,7 @@ from torchface.workflows.live.session_prompts import STEPS
 
 _FPS = 60.0  # of phones, where times do not say
 _SIZE = (480, 360)
-_SILENT, _WAIT = 0.1, 0.2  # seconds without a packet: until the first tick, between ticks at rest
-_RECENT, _SLOWEST, _QUICKEST = 301, 15.0, 120.0  # packets by which ticks go on as the sender did; a second
+_SILENT, _TICK, _WAIT = 0.1, 1 / 30, 0.2  # seconds without a packet: until the first tick, between ticks, at rest
 _HOLD, _RELAX, _RESTS = 0.5, 0.4, 4.0  # seconds: the last face is held, falls to 1/e, is at rest
 _NO_ROUTE = "192.0.2.1"  # an address for documentation: nothing is sent to it
 _CUTOFF, _SPREAD, _SPEED = 9.0, 9.0, 10.0  # Hz without smoothing, by how much less with all, and for each unit a second
@@ -44,12 +40,11 @@ class ReceivedSource:
         self._in_parts = self.receiver.scheme == "osc"  # where each weight may come in a packet of its own
         self.face: ReceivedFace | None = None
         self.fresh, self.heard = False, float("-inf")
-        self._came: deque[float] = deque(maxlen=_RECENT)
         self._picture = np.empty((0, 0, 3), np.uint8)
 
     def frames(self) -> Iterator[tuple[float, np.ndarray]]:
         """When each face came, and a picture without pixels; ``face`` is the face."""
-        wait, due = _WAIT, 0.0
+        wait = _WAIT
         while True:
             faces = self.receiver.faces(wait)
             if len(faces) > 1 and (not self._every or self._in_parts):
@@ -57,43 +52,13 @@ class ReceivedSource:
                 faces = faces[-1:]
             for came, face in faces:
                 self.face, self.fresh, self.heard = face, True, came
-                self._came.append(came)
                 yield came, self._picture
                 wait = _SILENT
             if not faces:
                 now = time.perf_counter()
                 self.fresh = False
-                tick = _WAIT if self.rests else self._tick()
-                came = due if now - due < tick else now  # ticks are even, however late the processor comes to each
-                yield came, self._picture
-                due = came + tick
-                wait = max(0.0, due - time.perf_counter())
-
-    @property
-    def rests(self) -> bool:
-        """Whether nobody has sent for so long that all is at rest."""
-        return time.perf_counter() - self.heard >= _RESTS
-
-    @property
-    def alone(self) -> str:
-        """Where this machine alone can send to the address: that, and what to listen at for a phone; else empty."""
-        receiver = self.receiver
-        if not receiver.host or not ip_address(receiver.host).is_loopback:
-            return ""
-        return f"which no other machine reaches; for a phone, listen at {receiver.scheme}://:{receiver.port}"
-
-    @property
-    def silence(self) -> str:
-        """What to say where no face has arrived; empty where one has."""
-        if self.face is not None:
-            return ""
-        nothing = "no face" if self.receiver.counts.malformed else "nothing"
-        return f"{nothing} arrived at {self.receiver.address}" + (f", {self.alone}" if self.alone else "")
-
-    def _tick(self) -> float:
-        """The sender's usual step, seconds: the take's rate is the sender's also where the face relaxes."""
-        rate = usual_rate(measured_rate(np.diff(self._came))) if len(self._came) > 1 else _FPS
-        return 1 / min(max(rate, _SLOWEST), _QUICKEST)
+                wait = _TICK if now - self.heard < _RESTS else _WAIT
+                yield now, self._picture
 
     def close(self) -> None:
         """Gives the port back."""
@@ -144,7 +109,6 @@ class ReceivedSolver:
             gaze=-torch.stack([rotations[6:8], rotations[3:5]]),
             calibrated=self._calibration.learned,
             found=ever and self._lost <= _HOLD,
-            idle=not self._source.fresh and self._source.rests,
         )
 
     def _smoothed(self, values: Tensor, interval: float, smoothing: float) -> Tensor:
@@ -187,9 +151,7 @@ class ReceivedWatch:
         receiver = self._source.receiver
         if receiver.address.startswith("ifacialmocap://") and receiver.asks:
             return f"Waiting for a face: {receiver.address} is asked to send; open iFacialMocap there"
-        if alone := self._source.alone:
-            return f"Waiting for a face at port {receiver.port} of {receiver.host}, {alone}"
-        return f"Waiting for a face at port {receiver.port}: have the app send to {receiver.host or own_address()}"
+        return f"Waiting for a face at port {receiver.port}: have the app send to {own_address()}"
 
 
 def own_address() -> str:

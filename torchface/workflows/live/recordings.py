@@ -20,7 +20,6 @@ from torchface.files.temporary_files import new_temporary, remove_left_over
 from torchface.files.whole_files import all_or_none, make_folder, write_file
 from torchface.files.write_errors import unwritten
 from torchface.io.gltf.performance_animation import Performance, performed_glb
-from torchface.io.tables.frame_rates import TimeSource, file_error, frame_times
 from torchface.io.weights.live_link_csv import save_live_link
 from torchface.io.weights.weight_csv import ROTATIONS, save_weights_csv
 from torchface.shape_names import ARKIT
@@ -31,6 +30,7 @@ from torchface.workflows.live.live_frames import LiveFrame, Say
 from torchface.workflows.live.take_film import FILM, TakeFilm
 
 _LOG = "frames"
+_EVEN = 1e-6  # seconds by which times that are even may be off
 _LOOK = 128  # frames between looks at how full the disk is
 _RESERVE, _NUMBER_BYTES = (
     2**26,
@@ -94,9 +94,11 @@ class FrameLog:
         angles = torch.from_numpy(rows["rotations"].astype(np.float64))
         columns = {name: angles[:, i].clone() for i, name in enumerate(ROTATIONS)}
         track = Track(self.names, torch.from_numpy(rows["weights"])[..., None])
-        if self.count > 1:  # as who reads the files has it
-            timing = frame_times(seconds.numpy(), TimeSource(file_error("recording"), np.arange(self.count)))
-            return Take(timing.fps, weights=track, extras={"columns": columns}, seconds=timing.seconds)
+        if self.count > 1:
+            fps = (self.count - 1) / float(seconds[-1])
+            even = torch.arange(self.count).double() / round(fps, 3)
+            if float((even - seconds).abs().max()) <= _EVEN:
+                return Take(round(fps, 3), weights=track, extras={"columns": columns})
         return Take(fps, weights=track, extras={"columns": columns}, seconds=seconds)
 
     def close(self) -> None:
@@ -139,7 +141,6 @@ class Recordings:
         self._place = folder
         self._begun: set[Path] = set()  # whose files may still be in the making
         self._began, self._found = 0.0, 0
-        self._idle: tuple[float, LiveFrame] | None = None
         self._saving: list[threading.Thread] = []
         self.saved: list[SavedTake] = []
 
@@ -170,7 +171,7 @@ class Recordings:
         """Begins a take, maybe with the camera's film, and returns its folder, in which no take lies."""
         self._place = self._next()
         self._begun.add(self._place)
-        self._log, self._found, self._idle = self._new_log(self._place), 0, None
+        self._log, self._found = self._new_log(self._place), 0
         self._film = TakeFilm(self._place / FILM) if filmed else None
         return self._place
 
@@ -192,18 +193,9 @@ class Recordings:
         return FrameLog(make_folder(place), ARKIT, columns)
 
     def add(self, came: float, frame: LiveFrame, picture: np.ndarray | None = None) -> None:
-        """Keeps a frame, if a take runs, and its picture, if it is filmed.
-
-        Of idle ones the last before a face is kept: nothing moves towards that face meanwhile.
-        """
+        """Keeps a frame, if a take runs, and its picture, if it is filmed."""
         if self._log is None:
             return
-        if frame.idle:
-            self._idle = came, frame
-            return
-        idle, self._idle = self._idle, None
-        if idle is not None and self._log.count:
-            self._log.append(idle[0], idle[1].weights, idle[1].rotations)
         if self._log.count == 0:
             self._began = came
         self._log.append(came, frame.weights, frame.rotations)
@@ -218,8 +210,7 @@ class Recordings:
         film, self._film = self._film, None
         if log is None:
             return
-        waited = self._idle is not None
-        given = (log, self._place, self._found, film, say, waited)
+        given = (log, self._place, self._found, film, say)
         thread = threading.Thread(target=self._save, args=given, name="torchface-recording")
         self._saving.append(thread)
         thread.start()
@@ -242,15 +233,11 @@ class Recordings:
         numbered = (self._folder / f"take_{number}" for number in range(2, _MAX_TAKES))
         return next(folder for folder in numbered if folder not in self._begun and not folder.exists())
 
-    def _save(
-        self, log: FrameLog, folder: Path, found: int, film: TakeFilm | None, say: Say | None, waited: bool
-    ) -> None:
+    def _save(self, log: FrameLog, folder: Path, found: int, film: TakeFilm | None, say: Say | None) -> None:
         with log:
             try:
                 if film is not None:  # before the summary, by which a take is listed
                     film.close()
-                if waited and not log.count:
-                    raise ValueRangeError("received no face, expected one")
                 if log.count and found == 0:
                     raise ValueRangeError(f"found a face in none of its {log.count} frames, expected one")
                 missing = self._write(log, folder, found) if log.count else ""
