@@ -164,7 +164,9 @@ def in_usual_units(take: Take, path: Path) -> Take:
     """The take with weights from 0 to 1 and rotations in radians; what is converted, a ``UserWarning`` says."""
     if take.weights is not None and all(map(is_action_unit, take.weights.names)):
         most = float(take.weights.values.nan_to_num(0.0).max()) if take.weights.values.numel() else 0.0
-        if _LARGEST_OVERSHOOT < most <= LARGEST_INTENSITY:
+        # A name in _r is OpenFace's of an intensity; others may be weights that go a little beyond 1.
+        usual = 1.0 if any(name.endswith("_r") for name in take.weights.names) else _LARGEST_OVERSHOOT
+        if usual < most <= LARGEST_INTENSITY:
             _warn(path, f"action units up to {most:.4g}", "0 to 1", "intensities from 0 to 5")
             scaled = take.weights.values / LARGEST_INTENSITY
             return replace(take, weights=Track(take.weights.names, scaled, take.weights.confidence))

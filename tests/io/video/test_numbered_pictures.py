@@ -42,3 +42,11 @@ def test_the_films_command_names_all_pictures(names: list[str], pattern: str, tm
 def test_a_folder_without_pictures_names_no_command(tmp_path: Path) -> None:
     (tmp_path / "one1.png").write_bytes(b"")
     assert film_of_pictures(tmp_path) == ""
+
+
+def test_a_missing_number_is_said_in_place_of_a_command_that_stops_there(tmp_path: Path) -> None:
+    for number in (1, 2, 4, 5):
+        (tmp_path / f"f_{number:04d}.png").touch()
+    words = film_of_pictures(tmp_path)
+    assert "its 4 numbered pictures 1 are missing" in words
+    assert "ffmpeg" not in words

@@ -37,3 +37,10 @@ def test_a_plain_table_of_action_units_to_five_is_taken_for_intensities(tmp_path
 def test_weights_of_action_units_that_overshoot_one_stay(most: float, tmp_path: Path) -> None:
     (tmp_path / "over.csv").write_text(f"frame,time,AU01,AU12\n0,0.0,0,0.5\n1,0.04,1,{most}\n")
     assert load_take(tmp_path / "over.csv").weights.values[:, 1, 0].tolist() == pytest.approx([0.5, most])
+
+
+def test_names_of_intensities_are_intensities_from_one_on(tmp_path: Path) -> None:
+    (tmp_path / "quiet.csv").write_text("frame,time,AU01_r,AU12_r\n0,0.0,0,0.5\n1,0.04,1,1.4\n")
+    with pytest.warns(UserWarning, match="action units up to 1.4, expected 0 to 1; they are taken for intensities"):
+        take = load_take(tmp_path / "quiet.csv")
+    assert take.weights.values[:, 1, 0].tolist() == pytest.approx([0.1, 0.28])

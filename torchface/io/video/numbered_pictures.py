@@ -22,7 +22,9 @@ def film_of_pictures(folder: Path) -> str:
     digits = min(map(len, numbers))  # zeros lead where numbers of fewer digits have as many places
     place = f"%0{digits}d" if digits > 1 else "%d"
     pattern = f"{folder}/{before}".replace("%", "%%") + place + ending
-    first = min(map(int, numbers))
+    first, count = min(map(int, numbers)), len(set(map(int, numbers)))
+    if missing := max(map(int, numbers)) - first + 1 - count:
+        return f"; between the first and the last of its {count} numbered pictures {missing} are missing, expected none"
     start = f" -start_number {first}" if first else ""
     return (
         f"; of its {len(numbers)} numbered pictures ffmpeg makes a film, at the rate at which they were taken: "

@@ -28,6 +28,7 @@ _CHUNK = 32
 _MAX_DISTANCES = 2**29
 _SAME_RATE = 0.002
 _SAME_FRAME = 0.25  # of a frame by which times may differ
+_ROUNDED = 1e-6  # seconds
 _REACH = 0.4
 _GROUPS = ("round the jaw", "round the brows", "round the nose", "round the eyes", "round the mouth")
 _GROUP_OF_LANDMARK = (*[0] * 17, *[1] * 10, *[2] * 9, *[3] * 12, *[4] * 20)
@@ -152,7 +153,7 @@ def _pairs(found: AnimatedMesh, true: AnimatedMesh, settings: EvaluationSettings
         return rows, true_rows, [f"{note} of the truth"]
     if not alike and found.count != true.count:
         rows = torch.arange(found.count) if found.count < true.count else nearest.unique()
-        inside = (here[rows] >= there[0] - _SAME_FRAME / fastest) & (here[rows] <= there[-1] + _SAME_FRAME / fastest)
+        inside = (here[rows] >= there[0] - _ROUNDED) & (here[rows] <= there[-1] + _ROUNDED)  # beyond it is held still
         before, fraction = frames_beside(there, here[rows])
         true_rows = before + fraction
         beside = (there[true_rows.round().long()] - here[rows]).abs() * true.fps <= 1
