@@ -27,7 +27,7 @@ from torchface.temporal.interpolation import values_at
 from torchface.temporal.key_reduction import KeyReduction, kept_keys, reduction_error
 from torchface.workflows.head_rotations import still_head_columns
 
-_SHOWN, _IBUG = 8, 68
+_SHOWN = 8
 _KEPT = (".glb", ".vrm")  # rigs' files that are written again with all that they have
 _ROUNDED = 1e-3  # what a file's rounding leaves beyond 0 or 1
 
@@ -128,11 +128,9 @@ def _with_eyes(take: Take, rig: BlendshapeRig) -> Take:
     if "columns" in take.extras:
         return take
     assert take.weights is not None
-    notes, onto = rig.neutral.annotations, mapping(take.weights.names, ARKIT).to(take.weights.values)
-    annotated = notes is not None and notes.landmarks is not None and len(notes.landmarks) == _IBUG
-    turns = (Eyeballs.of(rig) if annotated else Eyeballs.usual()).turns
+    onto = mapping(take.weights.names, ARKIT).to(take.weights.values)
     weights = Track(ARKIT, (take.weights.values[..., 0] @ onto.T)[..., None])
-    return replace(take, extras=take.extras | {"columns": still_head_columns(weights, turns)})
+    return replace(take, extras=take.extras | {"columns": still_head_columns(weights, Eyeballs.of(rig).turns)})
 
 
 def write_weights(

@@ -72,9 +72,9 @@ def eye_signals(
     visible = torch.where(torch.isnan(visibility), 1.0, visibility).clamp(0, 1)
     resting, shutting = (pose - 1).abs() < 0.5, (pose - 5).abs() < 0.5
 
-    level, floor = usual + before.lids[:, 0], _SHUT + before.lids[:, 1]
-    span = (level - floor).clamp(min=0.03)
-    part = (opening - floor) / span
+    level, lowest = usual + before.lids[:, 0], _SHUT + before.lids[:, 1]
+    span = (level - lowest).clamp(min=0.03)
+    part = (opening - lowest) / span
     looks = ~torch.isnan(gaze).any(1)
     seen = torch.where(looks[:, None], gaze, 0.0)
     gaze_trust = looks * visible * (1 - shut) * shown_iris(part)
@@ -93,7 +93,7 @@ def eye_signals(
     any_gaze = gaze_trust.max().expand(2)
 
     by_look = 1 + looking @ look_weights(ahead) * any_gaze
-    rested = floor + (opening - floor) / by_look.clamp(min=0.4)
+    rested = lowest + (opening - lowest) / by_look.clamp(min=0.4)
     # Narrow eyes stay so, blinks do not: what is far below the level counts, and moves it slowly.
     counts = learns * known * visible * (shut < SURELY_OPEN) * (part > _NARROWEST) * ~shutting
     falls = torch.where(resting, 1.0, torch.where(rested < level, _DOWNWARD, 1.0))
@@ -101,7 +101,7 @@ def eye_signals(
     opened = before.lids[:, 0] + lid_rate * (rested - level)
     is_shut = learns * known * visible * ((shut > SURELY_SHUT) | (shutting & (part < 0.6)))
     shut_rate = is_shut * interval / (before.lids_seen[:, 1].clamp(max=_SHUT_MEMORY) + _SHUT_PRIOR + interval)
-    closes = before.lids[:, 1] + shut_rate * (opening - floor)
+    closes = before.lids[:, 1] + shut_rate * (opening - lowest)
     lids = torch.stack([opened, closes], dim=1)
     lids_seen = before.lids_seen + interval * torch.stack([counts, is_shut], dim=1)
 

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.spheres import nearest_sphere
+from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 
@@ -55,14 +56,16 @@ class Eyeballs:
 
     @staticmethod
     def of(rig: BlendshapeRig) -> "Eyeballs":
-        """By a rig's regions ``eyeball_right`` and ``eyeball_left``; what those do not show is as people have it.
+        """By a rig's regions ``eyeball_right`` and ``eyeball_left`` and its 68 landmarks; what those do not show is as
+        people have it.
 
         Of shapes that are halves or have no twin among ARKit's, and of eyeballs that a joint turns, the turn is the
         usual one.
         """
         made, notes = Eyeballs.usual(), rig.neutral.annotations
-        regions = {} if notes is None else notes.regions
-        marks = rig.vertices[rig.neutral.landmarks].detach().double()
+        if notes is None or notes.landmarks is None or len(notes.landmarks) != COUNT:
+            return made
+        regions, marks = notes.regions, rig.vertices[notes.landmarks].detach().double()
         names = arkit_names(rig.names)
         for eye, (side, corners) in enumerate(zip(("right", "left"), CORNERS, strict=True)):
             mask = regions.get(f"eyeball_{side}")
