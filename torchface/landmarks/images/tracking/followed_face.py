@@ -13,10 +13,8 @@ from torchface.landmarks.images.person_identity import IDENTITY, LOOK_MARGIN, fa
 
 _SIZE = 20  # pixels of the crop that a look is read from
 _LOOK = 3 * _SIZE * _SIZE
-_SAMPLES, _PARTS = (
-    96,
-    16,
-)  # rows or columns of a picture that are looked at, and parts a side, each of which is compared
+_SAMPLES = 96  # rows or columns of a picture that are looked at
+_PARTS = 16  # parts a side of it that are compared each
 # A cut changes a picture so much, 1 less its correlation, and so many times as much as the frame before did: who passes
 # close to the camera takes some frames. What correlates so much is as it was.
 _CUT, _SUDDEN, _UNCHANGED = 0.25, 4.0, 0.9
