@@ -56,10 +56,11 @@ def test_benchmarks_that_pages_name_are_there() -> None:
 
 def test_limits_that_a_page_names_are_the_code_s() -> None:
     page = (DOCS / "concepts" / "what_torchface_notices.md").read_text()
-    named = re.findall(r"`(\w+)` = (\S+) in `([\w/]+)\.py`", page)
-    assert len(named) > 5
-    for name, value, file in named:
-        module = importlib.import_module(f"torchface.{file.replace('/', '.')}")
+    named = re.findall(r"(-?[\d._]+) \(`(\w+)\.(\w+)`\)", page)
+    assert len(named) > 90
+    for value, file, name in named:
+        (path,) = (REPOSITORY / "torchface").rglob(f"{file}.py")
+        module = importlib.import_module(".".join(path.relative_to(REPOSITORY).with_suffix("").parts))
         assert getattr(module, name) == float(value), f"{file}: {name}"
 
 
