@@ -5,6 +5,7 @@ from typing import Any
 import pytest
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from planted.crossing_people import crossing_film
 from torchface import zoo
@@ -140,6 +141,26 @@ def test_it_stays_with_the_largest_and_finds_it_again(webcam: Webcam, portrait: 
     assert column(webcam.step(both(small, head))) < 190  # the one that is where it was, though another is larger
     webcam.state = torch.zeros(STATE)
     assert column(webcam.step(both(small, head))) > 190  # forgotten: the largest
+
+
+def test_after_a_cut_the_face_is_found_at_once_elsewhere(webcam: Webcam, portrait: tuple[Tensor, Tensor]) -> None:
+    generator = torch.Generator().manual_seed(0)
+    walls = [
+        interpolate(255 * torch.rand(1, 3, 6, 8, generator=generator), size=(300, 400), mode="bicubic")[0]
+        .clamp(0, 255)
+        .byte()
+        for _ in range(2)
+    ]
+
+    def shown(wall: int, left: int) -> Tensor:
+        frame = walls[wall].clone()
+        frame[:, 75:225, left : left + 150] = portrait[0]
+        return frame
+
+    first, *_ = [webcam.step(shown(0, 10)) for _ in range(4)][::-1]
+    after = webcam.step(shown(1, 240))
+    assert column(after) == pytest.approx(column(first) + 230, abs=2)
+    assert column(webcam.step(shown(1, 240))) == pytest.approx(column(after), abs=1)
 
 
 def test_a_face_with_too_few_visible_landmarks_to_be_solved_is_none(

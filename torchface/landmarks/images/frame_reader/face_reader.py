@@ -37,10 +37,12 @@ from torchface.landmarks.images.person_identity import (
     is_other,
     known_look,
 )
+from torchface.landmarks.images.picture_cut import PARTS, cut_between, small_copy
 from torchface.shape_names import ARKIT
 
 _PLACED = 16
-STATE = _PLACED + IDENTITY
+_SEEN = _PLACED + IDENTITY
+STATE = _SEEN + 3 * PARTS**2 + 1
 """Numbers that a reader hands on."""
 
 _FAR, _LOOSE = 0.75, 0.25  # shared share of two places
@@ -111,10 +113,14 @@ class FaceReader(nn.Module):
         place, anchor, size = state[:5], state[5:8], picture_size(image)
         following, missing, doubt, since, attempt, covered = state[8:14].unbind()
         same = (size == state[14:_PLACED]).all()
-        # Another picture size is another camera: its face may be anywhere.
-        place, people = place * same, state[_PLACED:] * same
+        # Another picture size is another camera: its face may be anywhere. So may that of another picture after a cut.
+        picture = small_copy(image)
+        cut, change = cut_between(state[_SEEN:-1].view(3, PARTS, PARTS), picture, state[-1])
+        cut = cut & same
+        missing = torch.where(cut, _PATIENCE, missing)
+        place, people = place * same, state[_PLACED:_SEEN] * (same & ~cut)
         known = (following > 0.5) & same
-        late = known & (interval > _LONGEST)
+        late = known & ((interval > _LONGEST) | cut)
         followed = known & ~late
         crowded = is_beside(people)
         hidden = crowded & is_awaited(people)
@@ -122,7 +128,7 @@ class FaceReader(nn.Module):
         doubted = followed & (doubt >= _DOUBT)
         lost_now = ~followed & ((missing <= _EAGER) | (since >= _PAUSE) | hidden)
         pause = torch.where(covered > 0.5, _COVERED, _COUNTED)
-        searched = (doubted & (since >= _DOUBT)) | lost_now | (followed & (crowded | (since >= pause)))
+        searched = (doubted & (since >= _DOUBT)) | lost_now | cut | (followed & (crowded | (since >= pause)))
         asked = doubted & searched
         # Who is about as large as the face that is followed is seen in a small copy too.
         enough = (size.amax(0) * _ENOUGH / place[2].clamp(min=1)).clamp(max=INPUT_SIZE)
@@ -135,7 +141,7 @@ class FaceReader(nn.Module):
         )
         there, confirmed = found[5] > 0.5, found[6] > 0.5
         # After a long while too it is where it was, if it is seen there, or nowhere.
-        followed, asked = followed | (late & (confirmed | ~there)), asked | late
+        followed, asked = followed | (late & ((confirmed & ~cut) | ~there)), asked | late
         people = after_boxes(people, found[7:].view(CANDIDATES, 4), searched, interval)
         begin = torch.where(followed, sought(place, anchor), found[:5])
         ready = plausible(begin, size, settings.smallest) & (followed | there)
@@ -186,7 +192,9 @@ class FaceReader(nn.Module):
         ]
         anchor = torch.where(good & ~followed, relation(own, shown), anchor)
         people = after_face(people, own, appearance, (good, stranger & (followed | there)), interval)
-        after = torch.cat([torch.where(good, own, place), anchor, torch.stack(counts), size, people])
+        own = torch.where(good, own, place * ~cut)
+        seen = [size, people, picture.flatten(), change[None]]
+        after = torch.cat([own, anchor, torch.stack(counts), *seen])
         face = read_eyes(image, looked, self.eyes)
         nothing = dict.fromkeys(("landmarks", "iris", "openness", "closed", "expression"), torch.nan)
         nothing |= dict.fromkeys(("visibility", "presence", "eye_visibility"), 0.0)
@@ -227,7 +235,7 @@ class FaceReader(nn.Module):
 def people_beside(state: Tensor) -> Tensor:
     """How many other people a reader that left a state (STATE,) has seen beside the face; see
     :func:`~torchface.landmarks.images.person_identity.counted_beside`."""
-    return counted_beside(state[_PLACED:])
+    return counted_beside(state[_PLACED:_SEEN])
 
 
 def _either(

@@ -4,24 +4,20 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
-from torch.nn.functional import adaptive_avg_pool2d
 
 from torchface.errors import ShapeError
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop
 from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.person_identity import IDENTITY, LOOK_MARGIN, face_look, look_alone
+from torchface.landmarks.images.picture_cut import PARTS, cut_between, small_copy
 
 _SIZE = 20  # pixels of the crop that a look is read from
 _LOOK = 3 * _SIZE * _SIZE
-_SAMPLES = 96  # rows or columns of a picture that are looked at
-_PARTS = 16  # parts a side of it that are compared each
-# A cut changes a picture so much, 1 less its correlation, and so many times as much as the frame before did: who passes
-# close to the camera takes some frames. What correlates so much is as it was.
-_CUT, _SUDDEN, _UNCHANGED = 0.25, 4.0, 0.9
+_UNCHANGED = 0.9  # correlation from which a part of a picture is as it was
 _NEAR, _SMALLER, _LARGER = 0.75, 0.6, 1.6  # sides of the box, and factors of its size
 
 LOOK = _LOOK  # numbers of a look
-MEMORY = 5 + 3 + 2 * 3 * _PARTS**2 + IDENTITY + 6  # numbers that a followed face is packed into
+MEMORY = 5 + 3 + 2 * 3 * PARTS**2 + IDENTITY + 6  # numbers that a followed face is packed into
 
 
 @dataclass(eq=False)
@@ -49,7 +45,7 @@ class FollowedFace:
 
     def pack(self) -> Tensor:
         """All of it as a tensor (1758,) float64; NaN for unknown."""
-        size = 3 * _PARTS**2
+        size = 3 * PARTS**2
         parts = (self.place, 5), (self.anchor, 3), (self.picture, size), (self.shown, size), (self.people, IDENTITY)
         known = [torch.full((size,), torch.nan) if part is None else part.cpu().flatten() for part, size in parts]
         counts = [self.missed, self.frames, self.unconfirmed, self.covered, self.change, self.cut]
@@ -60,10 +56,10 @@ class FollowedFace:
         """What :meth:`pack` packed."""
         if packed.shape != (MEMORY,):
             raise ShapeError(f"resume: found a memory of {tuple(packed.shape)}, expected ({MEMORY},)")
-        size = 3 * _PARTS**2
+        size = 3 * PARTS**2
         *parts, people, counts = packed.float().split([5, 3, size, size, IDENTITY, 6])
         place, anchor, picture, shown = (part if bool(torch.isfinite(part).all()) else None for part in parts)
-        picture, shown = (None if part is None else part.view(3, _PARTS, _PARTS) for part in (picture, shown))
+        picture, shown = (None if part is None else part.view(3, PARTS, PARTS) for part in (picture, shown))
         missed, frames, unconfirmed, covered, change, cut = counts.nan_to_num(0.0).tolist()
         return cls(
             place,
@@ -81,20 +77,20 @@ class FollowedFace:
 
     def take_picture(self, image: Tensor) -> None:
         """Notes how a frame (H,W) or (3,H,W) looks, and whether a cut lies before it."""
-        step = max(1, min(image.shape[-2:]) // _SAMPLES)
-        picture = adaptive_avg_pool2d(image[..., ::step, ::step].float().expand(3, -1, -1), _PARTS)
-        change = 0.0 if self.picture is None else 1 - float(face_look(picture) @ face_look(self.picture))
-        self.cut |= change > max(_CUT, _SUDDEN * self.change)
-        self.picture, self.change = picture, change
+        picture = small_copy(image.expand(3, -1, -1).permute(1, 2, 0))
+        if self.picture is not None:
+            cut, change = cut_between(self.picture, picture, torch.tensor(self.change))
+            self.cut, self.change = self.cut or bool(cut), float(change)
+        self.picture = picture
 
     def is_new(self, box: Tensor, shape: torch.Size) -> bool:
         """Whether the last frame, of a shape (...,H,W), shows something else in a box (4,) than when the face was
         seen."""
         if self.picture is None or self.shown is None:
             return True
-        cell = box.new_tensor([shape[-1], shape[-2]]) / _PARTS
-        left, top = (box[:2] / cell).floor().clamp(0, _PARTS - 2).int().tolist()
-        right, bottom = ((box[:2] + box[2:]) / cell).ceil().clamp(2, _PARTS).int().tolist()
+        cell = box.new_tensor([shape[-1], shape[-2]]) / PARTS
+        left, top = (box[:2] / cell).floor().clamp(0, PARTS - 2).int().tolist()
+        right, bottom = ((box[:2] + box[2:]) / cell).ceil().clamp(2, PARTS).int().tolist()
         now, then = (face_look(one[:, top:bottom, left:right]) for one in (self.picture, self.shown))
         return float(now @ then) < _UNCHANGED
 
