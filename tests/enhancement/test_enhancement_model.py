@@ -14,7 +14,6 @@ from torchface.geometry.meshes.operators import border_vertices
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
 from torchface.synthetic.head.performer import performer
-from torchface.zoo import ModelCard, get_model, save_model
 
 
 def test_a_rigid_motion_of_the_input_moves_the_output_alike(model, database):
@@ -207,13 +206,6 @@ def test_a_full_disk_is_told_and_leaves_what_was_there(database, tmp_path, monke
         )
 
 
-def test_a_copy_and_a_saved_model_give_the_same(model, database, tmp_path):
-    expected = model(database.smooth[3:5])
-    assert torch.equal(copy.deepcopy(model)(database.smooth[3:5]), expected)
-    save_model(model, tmp_path / "actor", ModelCard("MIT", "made", {}, "none"))
-    assert torch.equal(get_model(tmp_path / "actor")(database.smooth[3:5]), expected)
-
-
 def test_what_is_not_of_this_mesh_or_unit_is_refused(model, database):
     with pytest.raises(TopologyError, match=r"found \(1, 100, 3\), expected \(T,"):
         model(torch.zeros(1, 100, 3))
@@ -291,19 +283,3 @@ def test_flicker_of_weights_found_frame_by_frame_is_damped(model, database):
         lag.append(float((found.vertices - noise - clean.vertices).square().mean().sqrt()))
     assert flicker[1] < 0.6 * flicker[0]
     assert lag[1] < 1.1 * lag[0]
-
-
-def test_a_model_of_another_precision_prepares_anew(model, database):
-    frames = database.smooth[3:6]
-    single = model(frames)  # prepared once in single precision
-    double = copy.deepcopy(model).to(torch.float64)
-    found = double(frames.double())
-    assert found.dtype == torch.float64
-    assert float((found - single).abs().max()) < 5e-3
-    assert double.neutral.dtype == torch.float64
-    again = double.to(torch.float32)
-    again.components = model.components  # half precision is not distinguished from what was single
-    torch.testing.assert_close(again(frames), single, atol=2e-3, rtol=0)
-    moved = copy.deepcopy(model)
-    moved.coefficients *= 2.0
-    assert float((moved(frames) - frames).abs().max()) > 1.5 * float((single - frames).abs().max())

@@ -22,8 +22,10 @@ from pretended_device import pretended
 from torch import Tensor, nn
 from torch.utils._pytree import tree_leaves
 
+from torchface import zoo
 from torchface.errors import TraceError
 from torchface.onnx.corrective_graph import CorrectiveGraph
+from torchface.zoo.kinds import KINDS
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "concepts" / "modules.md"
 COLUMNS = (
@@ -169,6 +171,23 @@ def test_a_state_that_is_loaded_after_use_takes_effect(name: str) -> None:
         assert_same(outputs(example, module, *inputs), wanted)
     apart = [(a.double() - b.double()).abs().nan_to_num(0).max() for a, b in zip(before, wanted, strict=True)]
     assert max(apart) > 0.02
+
+
+@every_class
+def test_it_comes_back_from_config_and_state(name: str, tmp_path: Path) -> None:
+    """Nothing else is needed, no rig; from a folder, if its class is a kind of the zoo's."""
+    example = EXAMPLES[name]
+    inputs, module = example.inputs(), fresh(example)
+    if not hasattr(module, "from_config"):
+        pytest.skip("is made by its constructor alone")
+    if type(module) in KINDS.values():
+        zoo.save_model(module, tmp_path / "kept", zoo.ModelCard("MIT", "made", {}, "none"))
+        again = zoo.get_model(tmp_path / "kept")
+    else:
+        again = type(module).from_config(module.config)
+        again.load_state_dict(module.state_dict())
+    assert again.config == module.config
+    assert_same(outputs(example, again, *inputs), outputs(example, module, *inputs))
 
 
 @every_class

@@ -260,16 +260,6 @@ def test_the_module_follows_its_hessian() -> None:
     torch.testing.assert_close(qp(f), box_qp(3.0 * other.H, f, -2.0, 0.5), rtol=0, atol=1e-9)
 
 
-def test_the_module_changes_its_precision() -> None:
-    H = hessian(8, 0.5, 20.0)
-    f, x = planted(H, 5)
-    qp = BoxQP(H.float())
-    assert (qp(f.float()).double() - x).abs().max() < 1e-4
-    exact = qp.double()(f)
-    assert exact.dtype == torch.float64
-    torch.testing.assert_close(exact, box_qp(H.float().double(), f), rtol=0, atol=1e-10)
-
-
 def test_a_hessian_that_becomes_indefinite_is_refused() -> None:
     qp = BoxQP(torch.eye(3))
     qp.H[0, 0] = -1.0

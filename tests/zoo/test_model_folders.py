@@ -12,11 +12,9 @@ import pytest
 import torch
 
 from tests.zoo.conftest import CARD, morphable, noise
-from torchface import BlendshapeRig, TorchfaceError, zoo
-from torchface.capture import MarkerSolver
+from torchface import TorchfaceError, zoo
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.landmarks import UVLandmarkDetector
-from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.morphable.morphable_model import MorphableModel
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -34,28 +32,6 @@ def test_a_model_comes_back_as_it_was(home: Path) -> None:
     coefficients = noise(3, model.count)
     assert torch.equal(again(coefficients), model(coefficients))
     assert torch.equal(zoo.get_model(home / "mine")(coefficients), model(coefficients))
-
-
-def test_a_solver_needs_no_rig_to_come_back(solver: MarkerSolver, tmp_path: Path) -> None:
-    zoo.save_model(solver, tmp_path / "solver", CARD)
-    again = zoo.get_model(tmp_path / "solver")
-    assert (again.names, again.labels) == (solver.names, solver.labels)
-    markers = solver.rest.expand(5, -1, -1) + 0.5 * noise(5, *solver.rest.shape)
-    markers[2, 4] = torch.nan
-    assert torch.equal(again(markers), solver(markers))
-
-
-def test_a_head_with_colours_comes_back(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
-    vertices = dome_rig.vertices
-    shape = MorphableModel.fit(vertices + noise(5, *vertices.shape))
-    color = MorphableModel.fit(torch.rand(5, *vertices.shape, generator=torch.Generator().manual_seed(1)))
-    head = HeadModel.on(dome_rig.neutral, shape, color)
-    zoo.save_model(head, tmp_path / "head", CARD)
-    again = zoo.get_model(tmp_path / "head")
-    first, second = (one.mesh(torch.ones(4), torch.ones(4)) for one in (head, again))
-    assert torch.equal(first.vertices, second.vertices)
-    assert torch.equal(first.colors, second.colors)
-    assert first.fingerprint() == second.fingerprint()
 
 
 def test_a_detector_is_saved_in_the_same_format(tmp_path: Path) -> None:

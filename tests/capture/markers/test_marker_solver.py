@@ -160,12 +160,6 @@ def test_bad_settings_say_what_is_wrong(small_rig: BlendshapeRig, small_attachme
         MarkerSolver(small_rig, replace(small_attachment, fingerprint="another mesh"))
 
 
-def test_a_moved_solver_solves_in_its_new_precision(setting: tuple[MarkerSolver, Tensor, Tensor]) -> None:
-    solver, weights, markers = setting
-    solver(markers)
-    torch.testing.assert_close(solver.double()(markers), weights, rtol=0, atol=1e-4)
-
-
 def test_a_program_of_ones_own_finds_the_same_weights(small_rig: BlendshapeRig, small_attachment: Attachment) -> None:
     """With gaps and without, differentiable, and there again in a solver made of config and state."""
     _, markers = performed(small_rig, small_attachment, 8)

@@ -133,14 +133,6 @@ def test_landmarks_that_are_not_seen_are_skipped(small: BlendshapeRig) -> None:
     torch.testing.assert_close(exact(small)(wrong, confidence=trust).weights, weights, atol=1e-3, rtol=0)
 
 
-def test_float32_is_float64(small: BlendshapeRig) -> None:
-    found = film(small, acted(3), *poses(3), noise=0.5)
-    solver = VideoSolver(small, None, K)
-    one, other = solver(found.float()), solver(found)
-    assert one.weights.dtype == one.rotation.dtype == torch.float32
-    torch.testing.assert_close(one.weights.double(), other.weights, atol=2e-3, rtol=0)
-
-
 @settings(max_examples=5)
 @given(st.floats(-0.4, 0.4), st.floats(-0.4, 0.4), st.floats(-0.3, 0.3))
 def test_turning_head_and_camera_alike_leaves_the_weights(pitch: float, yaw: float, roll: float) -> None:

@@ -128,16 +128,6 @@ def test_another_rate_is_predicted_as_surely_as_it_says(learned: DynamicsPrior, 
     assert 0.6 < float((error.square() / variance).mean().sqrt()) < 1.4
 
 
-def test_a_saved_prior_of_another_rate_predicts_the_same(learned: DynamicsPrior) -> None:
-    adapted = adapt_dynamics(learned, learned.names, 25.0)
-    assert isinstance(adapted, AdaptedDynamicsPrior)
-    copy = AdaptedDynamicsPrior.from_config(adapted.config).to(learned.center)
-    copy.load_state_dict(adapted.state_dict())
-    windows = torch.rand(2, adapted.window, len(learned.names)).to(learned.center)
-    for found, wanted in zip(copy(windows), adapted(windows), strict=True):
-        assert torch.equal(found, wanted)
-
-
 def test_rates_too_far_away_and_windows_too_short_are_refused(learned: DynamicsPrior) -> None:
     with pytest.raises(ValueRangeError, match=r"found 2 frames a second, expected from 7\.5 to 480"):
         adapt_dynamics(learned, learned.names, 2.0)

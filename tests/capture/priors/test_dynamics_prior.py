@@ -9,7 +9,6 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from torch import Tensor
 
-from torchface import zoo
 from torchface.capture import DynamicsPrior, DynamicsSettings
 from torchface.capture.energy import Quadratic
 from torchface.capture.priors import face_regions, windows_of
@@ -179,15 +178,6 @@ def test_a_face_at_rest_stays_where_no_take_was(swinging: DynamicsPrior) -> None
     raised = torch.full((1, 3, 5), 0.95)
     mean, _ = swinging(raised)
     assert float((mean - 0.95).abs().max()) < 0.05
-
-
-def test_the_zoo_keeps_it(prior: DynamicsPrior, tmp_path: Path) -> None:
-    zoo.save_model(prior, tmp_path / "kept", zoo.ModelCard("MIT", "made up", {}, "none"))
-    other = zoo.get_model(tmp_path / "kept")
-    windows = torch.rand(3, 3, 52, generator=torch.Generator().manual_seed(1))
-    assert (other.names, other.window, other.fps, other.input_noise) == (prior.names, 3, 60.0, 0.0)
-    for found, expected in zip(other(windows), prior(windows), strict=True):
-        assert torch.equal(found, expected)
 
 
 @pytest.mark.bench

@@ -1,7 +1,5 @@
 """Densities against scikit-learn and scipy, their quadratics against finite differences."""
 
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
@@ -106,16 +104,6 @@ def test_the_papers_form_is_flat_near_the_data_and_guarded_far_from_it() -> None
     energy = prior.energy(at.detach())
     torch.testing.assert_close((energy.H @ at.detach()[..., None])[..., 0] + energy.f, slope, rtol=1e-6, atol=1e-6)
     assert bool(torch.isfinite(prior.energy(torch.full((1, 5), 30.0, dtype=torch.float64)).H).all())
-
-
-@pytest.mark.parametrize("fit", [ShapePrior.fit, ReciprocalPrior.fit])
-def test_config_and_state_rebuild_it(fit: Callable[..., ShapePrior]) -> None:
-    prior = fit([clusters(40), clusters(40, seed=1)], NAMES)
-    other = type(prior).from_config(prior.config)
-    other.load_state_dict(prior.state_dict())
-    w = clusters(4, seed=2).float()
-    assert torch.equal(other.log_density(w), prior.log_density(w))
-    assert torch.equal(other.energy(w).H, prior.energy(w).H)
 
 
 def test_bad_input() -> None:

@@ -229,14 +229,6 @@ def test_a_rig_of_other_names_is_predicted_too(performers: list[BlendshapeRig]) 
     assert made.deltas[2][middle & ~left].norm(dim=1).max() < 0.05 * whole.deltas[1].norm(dim=1).max()
 
 
-def test_saved_and_loaded(people: tuple[Tensor, Tensor], tmp_path: Path) -> None:
-    model = ExpressionRegression.fit(*people, names=["smile", "frown"])
-    zoo.save_model(model, tmp_path / "m", zoo.ModelCard("MIT", "noise", {}, ""))
-    again = zoo.get_model(tmp_path / "m")
-    assert again.names == ("smile", "frown")
-    assert torch.equal(again(people[0]), model(people[0]))
-
-
 def test_awkward_people(people: tuple[Tensor, Tensor]) -> None:
     neutrals, expressions = people
     few = ExpressionRegression.fit(neutrals[:3], expressions[:3])

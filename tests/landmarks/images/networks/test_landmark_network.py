@@ -117,13 +117,6 @@ def test_what_is_covered_is_not_visible(pictures: tuple[torch.Tensor, ...]) -> N
     assert 0.05 < float(free.visible.mean() - hidden.visible.mean()) < 0.8
 
 
-def test_a_saved_network_comes_back(network: LandmarkNetwork, tmp_path) -> None:
-    zoo.save_model(network, tmp_path / "n", zoo.ModelCard("MIT", "none", {}, ""))
-    crops = torch.rand(2, 3, 64, 64)
-    with torch.no_grad():
-        torch.testing.assert_close(zoo.get_model(tmp_path / "n")(crops).landmarks, network(crops).landmarks)
-
-
 def test_wrong_shapes_and_settings_are_refused(network: LandmarkNetwork, pictures: tuple[torch.Tensor, ...]) -> None:
     with pytest.raises(ShapeError, match=r"found \(1, 3, 60, 64\), expected \(B,3,64,64\)"):
         network(torch.zeros(1, 3, 60, 64))
