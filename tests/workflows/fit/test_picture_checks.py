@@ -21,12 +21,12 @@ from torchface.synthetic import neutral_head
 from torchface.workflows.fit.fit_checks import strange_lines
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, find_in_photographs
 from torchface.workflows.fit.picture_checks import (
+    angle_lines,
     color_lines,
     cover_lines,
     edge_lines,
     light_lines,
     picture_lines,
-    profile_lines,
 )
 from torchface.workflows.named_finders import part_finder
 
@@ -187,20 +187,42 @@ def test_landmarks_that_no_head_has_are_remarked_on() -> None:
     assert "cat.png: found landmarks lie 6.7% of the eyes' distance" in lines[0]
 
 
+def remarks_on_angles(*yaws: float, pitch: float = 0.0) -> list[str]:
+    """Of a head that is seen at these yaw angles, the last time from a pitch angle, degrees."""
+    empty, marks = torch.zeros(0), torch.zeros(len(yaws), 68, 2)
+    pitches = [0.0] * (len(yaws) - 1) + [pitch]
+    cameras = tuple(
+        look_at(torch.zeros(3), *angles, width=200, height=200) for angles in zip(yaws, pitches, strict=True)
+    )
+    return angle_lines(ImageFit(neutral_head(texture=False), (), empty, empty, cameras, marks, marks, 1.0, empty))
+
+
 def test_profiles_alone_are_remarked_on() -> None:
     """A head seen from 70° to either side, beside a view from the front, and from 30°."""
-    empty = torch.zeros(0)
-
-    def lines(*yaws: float) -> list[str]:
-        cameras = tuple(look_at(torch.zeros(3), yaw, width=200, height=200) for yaw in yaws)
-        marks = torch.zeros(len(yaws), 68, 2)
-        return profile_lines(ImageFit(neutral_head(texture=False), (), empty, empty, cameras, marks, marks, 1.0, empty))
-
-    assert lines(30.0) == lines(70.0, 0.0) == []
-    (line,) = lines(70.0, -70.0)
+    assert remarks_on_angles(30.0) == remarks_on_angles(70.0, 0.0) == []
+    (line,) = remarks_on_angles(70.0, -70.0)
     assert "only profiles" in line
     assert "70°" in line
     assert "-70°" in line
+
+
+@pytest.mark.parametrize(
+    ("yaws", "words"),
+    [
+        ((-4.0, 0.0, 8.0), ("all 3 pictures", "-4° to 8°, 12° apart", "45° to either side")),
+        ((30.0, 40.0), ("all 2 pictures", "30° to 40°, 10° apart", "45° to the other side")),
+        ((-10.0, 12.0), ()),
+        ((3.0,), ()),
+    ],
+)
+def test_several_pictures_from_one_angle_are_remarked_on_once(yaws: tuple[float, ...], words: tuple[str, ...]) -> None:
+    lines = remarks_on_angles(*yaws)
+    assert len(lines) == bool(words)
+    assert all(word in line for line in lines for word in words)
+
+
+def test_a_view_from_below_shows_depth_too() -> None:
+    assert remarks_on_angles(0.0, 0.0, pitch=-25.0) == []
 
 
 def test_hidden_landmarks_do_not_count() -> None:

@@ -52,13 +52,13 @@ from torchface.workflows.fit.fit_landmarks import (
 from torchface.workflows.fit.fit_readings import with_readings
 from torchface.workflows.fit.fitted_character import dressed_rig
 from torchface.workflows.fit.picture_checks import (
+    angle_lines,
     color_lines,
     cover_lines,
     edge_lines,
     grey_lines,
     light_lines,
     picture_lines,
-    profile_lines,
 )
 from torchface.workflows.fit.sharpness_checks import sharpness_lines
 from torchface.workflows.fit.video_pictures import video_pictures
@@ -248,7 +248,7 @@ def fit_photographs(
     colors = None if one_film else torch.stack([part_colors(*one) for one in zip(images, parts, strict=True)])
     remarks += one_person_lines(photographs, marks, alone, bare, insist or one_film, expected, colors)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)
-    remarks += profile_lines(fit)
+    remarks += angle_lines(fit)
     if found:
         remarks += strange_lines(photographs, fit)
     else:
