@@ -107,6 +107,8 @@ def show_batch(report: BatchReport, columns: Sequence[Column], worst_by: str = "
         cells = [_written(outcome, column) for column in columns] if outcome.done else ["skipped"]
         table.add_row(outcome.name, *cells, *[""] * (len(columns) - len(cells)), f"{outcome.seconds:.1f}")
     console.print(table)
+    if verdict := _verdict(report.done):
+        console.print(Text(verdict))
     if legend:
         console.print(legend, highlight=False)
     remarks: dict[str, list[str]] = {}
@@ -124,6 +126,23 @@ def show_batch(report: BatchReport, columns: Sequence[Column], worst_by: str = "
     print_path(report.contact_sheet)
     if report.skipped:
         raise SystemExit(SOME_SKIPPED)
+
+
+def _verdict(done: Sequence[Outcome]) -> str:
+    """Which results are to be used, in a line; empty where the job does not say."""
+    from torchface.workflows.batch.outcomes import RESULT
+
+    words: dict[str, list[str]] = {}
+    for outcome in done:
+        words.setdefault(str(outcome.figures.get(RESULT, "")), []).append(outcome.name)
+    words.pop("", None)
+    ranked = sorted(words, key=["good", "partly usable", "poor", "none"].index)
+    parts = []
+    for word in ranked:
+        names = words[word]
+        listed = ", ".join(names[:_MAX_ROWS]) + (f" and {len(names) - _MAX_ROWS} more" * (len(names) > _MAX_ROWS))
+        parts.append(word if len(done) == 1 else f"{len(names)} {word}" + (f" ({listed})" * (word != "good")))
+    return f"result: {', '.join(parts)}" if parts else ""
 
 
 def _number(outcome: Outcome, figure: str) -> float:

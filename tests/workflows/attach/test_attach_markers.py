@@ -88,6 +88,9 @@ def test_markers_that_no_pose_explains_are_refused_with_the_flag_that_says_where
     assert "lie nowhere" not in str(refused.value)
     assert ("--initial says it roughly" in str(refused.value)) == said
     assert not (tmp_path / "out.json").exists()
+    insisted = attach(tmp_path / "rig.glb", tmp_path / "rom.c3d", tmp_path / "out.json", replace(settings, insist=True))
+    assert insisted.lines()[0] == insisted.verdict()
+    assert insisted.verdict().startswith("result: poor, the markers lie ")
 
 
 def test_a_head_that_moves_freely_in_the_volume_moves_no_site(tmp_path: Path) -> None:
@@ -111,6 +114,7 @@ def test_a_head_that_moves_freely_in_the_volume_moves_no_site(tmp_path: Path) ->
     apart = (still.fit.attachment.on(faces, rest) - freely.fit.attachment.on(faces, rest)).norm(dim=1)
     assert apart.max() < 0.3
     assert freely.warnings == still.warnings == ()
+    assert freely.verdict().startswith("result: good, the markers lie 0.1")
     assert freely.cleanup.masked.sum() == 0
     # The motion is that of every frame: without it the markers lie on the sites, in the direction that undo gives.
     seen = freely.fit.alignment.apply((take.markers.values @ turned.transpose(1, 2) + walked[:, None]).double())

@@ -209,6 +209,9 @@ def test_bad_examples_are_skipped_and_none_that_serves_ends_it(actor: Actor, tmp
     assert report.example_names == ("jawOpen",)
     assert float(report.examples.errors[-1, 0]) < 0.7 * float(report.examples.errors[0, 0])
     assert "skipped: example mouthSmileLeft.ply" in report.lines()[-1]
+    assert report.lines()[0] == report.verdict()
+    assert report.verdict().startswith("result: partly usable, 95 % of what the scan shows lie within 0.")
+    assert report.verdict().endswith("; 1 scan skipped")
 
 
 def test_mistakes_are_told(actor: Actor, tmp_path: Path) -> None:

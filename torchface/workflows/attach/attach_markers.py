@@ -29,7 +29,7 @@ from torchface.take import Take, Track
 from torchface.viz.figures.marker_maps import errors_by_iteration, site_views
 from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.contact_sheet import small_picture
-from torchface.workflows.batch.outcomes import Made
+from torchface.workflows.batch.outcomes import RESULT, Made, word_of
 from torchface.workflows.marker_input import (
     DEFAULT_OPTIONS,
     MARKER_TAKES,
@@ -40,7 +40,7 @@ from torchface.workflows.marker_input import (
 
 MOTIONS = replace(MARKER_TAKES, done="attached")
 
-_METHOD = "attach batch/2"
+_METHOD = "attach batch/3"
 _SHOWN_NAMES = 8
 # A marker of which more is masked is not cleaned: what is wrong with it is said.
 _MAX_MASKED = 0.5
@@ -66,6 +66,23 @@ class AttachReport:
     cleanup: Cleanup  # what was wrong with the take
     warnings: tuple[str, ...] = ()  # what the user should know before they use the sites
     remarks: tuple[str, ...] = ()  # what else there is to say
+    refused: bool = False  # whether the sites are written only because the user insists
+
+    def verdict(self) -> str:
+        """Whether the sites are to be used, in a line."""
+        last, open_sites = self.fit.errors[-1], len(self.fit.uncertainty.markers)
+        worst = (self.fit.attachment.labels or ())[int(last.argmax())]
+        lie = (
+            f"the markers lie {float(last.mean()):.2f} mm from their sites (mean over the markers; the worst, {worst}, "
+            f"{float(last.max()):.2f} mm)"
+        )
+        if self.refused:
+            return f"result: poor, {lie}; written as --insist says, see the warning"
+        if open_sites:
+            return f"result: partly usable, {open_sites} of {len(last)} sites are uncertain, see below; {lie}"
+        if self.warnings:
+            return f"result: partly usable, see the warning; {lie}"
+        return f"result: good, {lie}"
 
     def lines(self) -> list[str]:
         """For people to read."""
@@ -84,7 +101,8 @@ class AttachReport:
             lines.append(f"helmet or head: moved by up to {self.fit.motion.extent()}; solved along")
         if self.cleanup.defects:
             lines.append(f"cleanup: {self.cleanup.summary()}")
-        return [*(f"warning: {warning}" for warning in self.warnings), *lines, *self.remarks, *self._uncertain()]
+        warnings = [f"warning: {warning}" for warning in self.warnings]
+        return [self.verdict(), *warnings, *lines, *self.remarks, *self._uncertain()]
 
     def _uncertain(self) -> list[str]:
         """What the take leaves open."""
@@ -263,6 +281,7 @@ def attach(
     if head is not None:
         motion = head.moved_by(fit.alignment)
         fit = replace(fit, motion=motion if fit.motion is None else motion.after(fit.motion))
+    refused = False
     try:
         check_attachment(fit, loaded)
     except (AlignmentError, ValueRangeError) as error:
@@ -272,7 +291,7 @@ def attach(
             why += ", or the markers' shape alone does not show where they sit: --initial says it roughly"
         if not settings.insist:
             raise type(error)(f"{rom}: {why}; {_INSIST}") from None
-        notes = [*notes, why]
+        notes, refused = [*notes, why], True
     faces, vertices = loaded.neutral.faces, loaded.vertices
     before, after = start.on(faces, vertices), fit.attachment.on(faces, vertices)
     progress("writing")
@@ -282,7 +301,8 @@ def attach(
         if picture is not None:
             views = [site_views(loaded.neutral, before, after), errors_by_iteration(fit.errors)]
             save_rendered_image(sheet(views, 1), picture)
-    return AttachReport(fit, torch.linalg.vector_norm(after - before, dim=1), cleanup, tuple(notes), tuple(remarks))
+    moved = torch.linalg.vector_norm(after - before, dim=1)
+    return AttachReport(fit, moved, cleanup, tuple(notes), tuple(remarks), refused)
 
 
 @dataclass(frozen=True)
@@ -306,6 +326,7 @@ class MotionJob:
         return Made(
             (sites, picture),
             {
+                RESULT: word_of(done.verdict()),
                 "error_mm": error,
                 "worst_mm": float(last.max()),
                 "markers": len(done.fit.attachment.triangles),

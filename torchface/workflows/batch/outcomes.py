@@ -22,6 +22,9 @@ _MAX_RECORD = 16 * 2**20
 _DONE, _SKIPPED = "done", "skipped"
 _COLUMNS = ("name", "status", "seconds", "processor_seconds", "input", "results", "remarks")
 
+RESULT = "result"
+"""The figure that says whether an item's result is to be used: good, partly usable, poor or none."""
+
 Figures = Mapping[str, float | str]  # what was measured, by column of the table
 
 
@@ -63,6 +66,11 @@ class Outcome:
     def done(self) -> bool:
         """Whether there are results."""
         return not self.error
+
+
+def word_of(verdict: str) -> str:
+    """The word of a line ``result: WORD, ...``."""
+    return verdict.removeprefix("result: ").split(",")[0]
 
 
 def record_path(out: Path, item: BatchItem) -> Path:

@@ -34,9 +34,9 @@ from torchface.viz.figures.landmark_dots import with_dots
 from torchface.viz.figures.registration_views import lines_on_clay
 from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.contact_sheet import HEIGHT, WIDTH
-from torchface.workflows.batch.outcomes import Made
+from torchface.workflows.batch.outcomes import RESULT, Made, word_of
 
-_METHOD = "register/7"
+_METHOD = "register/8"
 """What results are made with; another number where the same scan and settings come to give another result."""
 _MAX_DISTANCE = 1.0  # end of the distance maps' scale, millimetres
 
@@ -81,6 +81,7 @@ class ScanJob:
         return Made(
             (result,),
             {
+                RESULT: word_of(record.verdict()),
                 "median_mm": record.median_distance,
                 "matched": record.matched,
                 "start": record.start,

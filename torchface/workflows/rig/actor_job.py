@@ -14,12 +14,12 @@ from torchface.viz.figures.error_maps import error_colors
 from torchface.workflows.batch.batch_items import SCAN_ENDINGS, BatchItem, ItemKind
 from torchface.workflows.batch.batch_job import model_content
 from torchface.workflows.batch.contact_sheet import face_picture
-from torchface.workflows.batch.outcomes import Made
+from torchface.workflows.batch.outcomes import RESULT, Made, word_of
 from torchface.workflows.rig.actor_report import ActorReport
 from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
 
 ACTORS = ItemKind("scan", "rigged", SCAN_ENDINGS)
-_METHOD = "rig batch/3"
+_METHOD = "rig batch/4"
 _MAX_DISTANCE = 1.0  # millimetres, red in the picture
 
 
@@ -55,6 +55,7 @@ class ActorJob:
         return Made(
             (path, done.figure),
             {
+                RESULT: word_of(done.verdict()),
                 "median_mm": record.median_distance,
                 "p95_mm": record.far_distance,
                 "shown": record.shown,

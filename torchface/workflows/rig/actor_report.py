@@ -24,6 +24,14 @@ class ActorReport:
     penetration: Penetration | None = None  # how far teeth, gums and eyes stand out of the skin
     predicted: int = 0  # how many of the shapes a model of expressions has predicted
 
+    def verdict(self) -> str:
+        """Whether the rig is to be used, in a line."""
+        found = self.neutral.record.verdict()
+        if not self.skipped:
+            return found
+        what = f"{len(self.skipped)} {'scans' if len(self.skipped) > 1 else 'scan'} skipped"
+        return found.replace("result: good", "result: partly usable", 1) + f"; {what}"
+
     def lines(self) -> list[str]:
         """For people to read."""
         record = self.neutral.record
@@ -31,6 +39,7 @@ class ActorReport:
         lines += [f"  note: {note}" for note in record.notes]
         if not record.bent:
             lines = [f"neutral: {note}" for note in record.notes]
+        lines.insert(0, self.verdict())
         lines.append(f"  figure: {self.figure}")
         lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
         if self.predicted:

@@ -77,9 +77,18 @@ class CharacterReport:
     figure: Path | None
     notes: tuple[str, ...] = field(default=())
 
+    def verdict(self) -> str:
+        """Whether the character is to be used, in a line."""
+        warned = sum(note.lstrip().startswith("warning") for note in self.notes)
+        there = f"{len(self.present)} of ARKit's shapes were there"
+        found = f"{len(self.made)} made, {there}" if self.made else f"{there}, none is made"
+        if not warned:
+            return f"result: good, {found}"
+        return f"result: partly usable, {found}; {warned} {'warnings' if warned > 1 else 'warning'} below"
+
     def lines(self) -> list[str]:
         """For people to read."""
-        return list(self.notes)
+        return [self.verdict(), *self.notes]
 
 
 def rig_character(

@@ -36,6 +36,12 @@ class PredictedRig:
     page: Path
     notes: tuple[str, ...]  # on a head that is likely not at rest
 
+    def verdict(self) -> str:
+        """Whether the rig is to be used, in a line."""
+        word = "partly usable, see the warning" if self.notes else "good"
+        learned, shapes = int(self.made.learned.sum()), len(self.made.rig.names)
+        return f"result: {word}, {shapes} shapes, {learned} of them predicted by {self.model}"
+
     def lines(self) -> list[str]:
         """For people to read."""
         made = self.made
@@ -43,7 +49,7 @@ class PredictedRig:
         unsure = [name for name, row in zip(made.rig.names, made.known & ~made.learned, strict=True) if row]
         line = f"rig: {len(made.rig.vertices)} vertices; of {len(made.rig.names)} shapes {learned} predicted by "
         line += f"{self.model}, {len(made.rig.names) - learned} transferred"
-        lines = [*(f"warning: {note}" for note in self.notes), line]
+        lines = [self.verdict(), *(f"warning: {note}" for note in self.notes), line]
         if unsure:
             lines.append(
                 f"  transferred though {self.model} knows them, its error would be larger: {', '.join(unsure)}"

@@ -8,13 +8,13 @@ import torch
 from torchface.files.content_keys import content_key
 from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.contact_sheet import face_picture
-from torchface.workflows.batch.outcomes import Made
+from torchface.workflows.batch.outcomes import RESULT, Made, word_of
 from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions
 from torchface.workflows.solve.head_camera import HeadCamera
 from torchface.workflows.solve.solution import SolveSettings
 from torchface.workflows.solve.solve_take import TakeInputs, TakeOutputs, solve_take
 
-_METHOD = "solve/1"
+_METHOD = "solve/2"
 
 
 @dataclass(frozen=True)
@@ -68,6 +68,7 @@ class TakeJob:
         return Made(
             (weights,),
             {
+                RESULT: word_of(done.verdict()),
                 "rmse_mm": median,
                 "rmse_p95_mm": float(rmse.nanquantile(0.95)),
                 "seen": done.seen,

@@ -10,13 +10,13 @@ from torchface.io.video.video_file import VIDEO_ENDINGS
 from torchface.workflows.batch.batch_items import BatchItem, ItemKind
 from torchface.workflows.batch.batch_job import model_content
 from torchface.workflows.batch.contact_sheet import face_picture
-from torchface.workflows.batch.outcomes import Made
+from torchface.workflows.batch.outcomes import RESULT, Made, word_of
 from torchface.workflows.track.track_inputs import TrackSettings
 from torchface.workflows.track.track_page import write_track_page
 from torchface.workflows.track.track_video import track_video
 
 VIDEOS = ItemKind("video", "tracked", VIDEO_ENDINGS)
-_METHOD = "track batch/1"
+_METHOD = "track batch/2"
 
 
 @dataclass(frozen=True)
@@ -47,6 +47,7 @@ class VideoJob:
         return Made(
             (*done.products.values(), page),
             {
+                RESULT: word_of(done.verdict()),
                 "frames": frames,
                 "fps": float(done.video.fps),
                 "seen": seen,
