@@ -49,7 +49,8 @@ def arkit(
             and its shape alone is not found.
         everything: Make all 52, also those that SOURCE has.
         temporal: Solve all frames of an animation together, smooth in time; --no-temporal solves each by itself.
-        fps: Frames a second of an animation; as its file says, or 30, if absent.
+        fps: Frames a second of an animation; as its file says, or 30, if absent. Of weights by name where their file
+            has neither times nor a rate.
         unit: Unit of SOURCE's file (mm, cm, m) where it is not the format's own.
     """
     from torchface.errors import ValueRangeError

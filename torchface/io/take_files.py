@@ -39,7 +39,7 @@ _SHARE, _MOST_PERCENT, _MOST_DEGREES = 0.1, 200.0, 360.0
 _LARGEST_OVERSHOOT = 1.5  # of an action unit from 0 to 1; one that is larger is an intensity
 
 
-def load_take(path: str | Path, unit: str | None = None) -> Take:
+def load_take(path: str | Path, unit: str | None = None, fps: float | None = None) -> Take:
     r"""Reads a performance; the kind of a ``.csv`` follows from its header.
 
     ==================================== =====================================================
@@ -61,6 +61,7 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
     Args:
         path: the file.
         unit: of its markers, ``"mm"``, ``"cm"``, ``"m"`` or ``"in"``; else what the file says (CSV: millimetres).
+        fps: frames a second of a ``.json`` that has neither times nor a rate.
 
     Raises:
         FileFormatError: the file is none of these, or is damaged.
@@ -82,7 +83,7 @@ def load_take(path: str | Path, unit: str | None = None) -> Take:
     if suffix == ".trc":
         return load_trc(path, unit)
     if suffix == ".json":
-        return in_usual_units(load_weight_json(path), path)
+        return in_usual_units(load_weight_json(path, fps), path)
     if suffix == ".gesichter":
         return load_live_link_packets(path)
     if suffix == ".txt":

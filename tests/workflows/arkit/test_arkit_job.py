@@ -2,6 +2,7 @@
 
 import json
 import math
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -268,6 +269,31 @@ def test_the_rate_is_the_files_and_another_is_said(
     save_weights_csv(Take(24.0, weights=Track(["jawOpen"], torch.zeros(3, 1, 1))), tmp_path / "named.csv")
     with pytest.raises(ValueRangeError, match=r"--fps: found 60, expected none beside weights, .* 24 a second"):
         lines_of("named.csv", 60.0)
+
+
+@pytest.mark.parametrize("kind", ["mediapipe", "audio2face", "anchors"])
+def test_the_rate_of_weights_without_times_is_set(folder: Path, tmp_path: Path, kind: str) -> None:
+    category = {"category_name": "jawOpen", "score": 0.5}
+    documents = {
+        "mediapipe": [{"face_blendshapes": [[category]]}] * 3,
+        "audio2face": {"facsNames": ["jawOpen"], "weightMat": [[0.5]] * 3},
+        "anchors": [{"blendShapes": {"jawOpen": 0.5}}] * 3,
+    }
+    source, out = tmp_path / "named.json", tmp_path / "w.csv"
+    source.write_text(json.dumps(documents[kind]))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        (line,) = animation_to_weights(folder / "rig.glb", source, out, AnimationSettings(fps=25.0), silent)
+    assert "3 frames of weights by name, 25 a second" in line
+    assert load_take(out).fps == pytest.approx(25.0)
+    timed = {
+        "mediapipe": [{"timestamp_ms": 20 * i, "face_blendshapes": [[category]]} for i in range(3)],
+        "audio2face": {"exportFps": 50, "facsNames": ["jawOpen"], "weightMat": [[0.5]] * 3},
+        "anchors": [{"timestamp": i / 50, "blendShapes": {"jawOpen": 0.5}} for i in range(3)],
+    }
+    source.write_text(json.dumps(timed[kind]))
+    with pytest.raises(ValueRangeError, match=r"--fps: found 25, expected none beside weights, .* 50 a second"):
+        animation_to_weights(folder / "rig.glb", source, out, AnimationSettings(fps=25.0), silent)
 
 
 def test_shapes_that_a_rig_has_are_kept_and_only_the_others_made(rig: BlendshapeRig, tmp_path: Path) -> None:

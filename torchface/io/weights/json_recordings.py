@@ -41,7 +41,7 @@ def is_weight_json(path: str | Path) -> bool:
     return _is_anchor(frames[0]) or any(map(_are_categories, frames))
 
 
-def load_weight_json(path: str | Path) -> Take:
+def load_weight_json(path: str | Path, fps: float | None = None) -> Take:
     """Reads Audio2Face's export (``facsNames``, ``weightMat``, ``exportFps``), frames of ARKit's face anchors, or of
     MediaPipe's Face Landmarker.
 
@@ -51,23 +51,27 @@ def load_weight_json(path: str | Path) -> Take:
     printed in Python or JavaScript, or a face's categories alone (``category_name``, ``score``); of several faces the
     first counts, a frame without one is NaN, and without times there are 30 frames a second, with a ``UserWarning``.
 
+    Args:
+        path: the file.
+        fps: frames a second of a file that has neither times nor a rate.
+
     Returns:
         weights (T,N,1), names as the file spells them, such as Audio2Face's 52 and 16 of the tongue; rotations in
         ``extras["columns"]``, radians, where there are transforms.
     """
     document = read_json(path, max_bytes=_MAX_BYTES)
     if isinstance(document.found, dict) and "weightMat" in document.found:
-        return _audio2face(document)
+        return _audio2face(document, fps)
     frames = document["frames"] if isinstance(document.found, dict) else document
     if (isinstance(document.found, dict) and not frames) or _is_face(frames.found):
         frames = replace(document, found=[document.found])
     if isinstance(frames.found, list) and any(map(_are_categories, frames.found)):
-        return _mediapipe(frames)
+        return _mediapipe(frames, fps)
     if not isinstance(frames.found, list) or not frames.found or frames.found == [{}]:
         raise document.error(
             "Audio2Face's facsNames and weightMat, or a list of frames with blendShapes, or with MediaPipe's categories"
         )
-    return _face_anchors(frames)
+    return _face_anchors(frames, fps)
 
 
 def _is_anchor(frame: object) -> bool:
@@ -104,7 +108,7 @@ def _score_name(category: dict[str, Any]) -> str | None:
     return name if isinstance(name, str) and "score" in category else None
 
 
-def _mediapipe(frames: Value) -> Take:
+def _mediapipe(frames: Value, fps: float | None) -> Take:
     rows = frames.rows(1, _MOST_FRAMES, f"1 to {_MOST_FRAMES} frames")
     weights = np.full((len(rows), len(ARKIT)), np.nan, np.float32)
     seen: set[int] = set()
@@ -129,10 +133,11 @@ def _mediapipe(frames: Value) -> Take:
     known = sorted(seen)
     key = next((key for key in _TIMES if isinstance(rows[0].found, dict) and key in rows[0].found), None)
     if key is None:
-        warnings.warn(
-            f"{frames.source}: found no timestamp in its frames; {UNKNOWN_RATE:g} a second are taken", stacklevel=4
-        )
-        timing = FrameTimes(UNKNOWN_RATE, None)
+        if fps is None:
+            warnings.warn(
+                f"{frames.source}: found no timestamp in its frames; {UNKNOWN_RATE:g} a second are taken", stacklevel=4
+            )
+        timing = FrameTimes(fps or UNKNOWN_RATE, None)
     else:
         times = np.array([row[key].number("a time") for row in rows]) / (1000.0 if key.lower().endswith("ms") else 1.0)
         timing = frame_times(times, TimeSource(file_error(frames.source)))
@@ -140,19 +145,20 @@ def _mediapipe(frames: Value) -> Take:
     return Take(timing.fps, weights=track, seconds=timing.seconds)
 
 
-def _audio2face(document: Value) -> Take:
+def _audio2face(document: Value, fps: float | None) -> Take:
     names = document["facsNames"].texts("the names of the shapes")
     if not 0 < len(names) <= _MOST_SHAPES or len(set(names)) < len(names) or not all(names):
         raise document["facsNames"].error(f"1 to {_MOST_SHAPES} names, each once")
     weights = document["weightMat"].tensor(None, len(names), expected=f"rows of {len(names)} numbers")
     if not len(weights):
         raise document["weightMat"].error("a frame at least")
-    rate = document["exportFps"].number("frames a second")
+    stated = document["exportFps"]
+    rate = fps if fps is not None and not stated else stated.number("frames a second")
     check_rate(rate, f"{document.source}: exportFps", FileFormatError)
     return Take(rate, weights=Track(names, weights.float()[..., None]))
 
 
-def _face_anchors(frames: Value) -> Take:
+def _face_anchors(frames: Value, fps: float | None) -> Take:
     rows = frames.rows(1, _MOST_FRAMES, f"1 to {_MOST_FRAMES} frames")
     shapes = rows[0]["blendShapes"].table(expected="weights by ARKit's names")
     names = tuple(shapes)
@@ -170,8 +176,11 @@ def _face_anchors(frames: Value) -> Take:
             head = _rotation(row["transform"])
             left, right = (_rotation(row[key]) for key in ("leftEyeTransform", "rightEyeTransform"))
             turned.append(torch.cat([_angles(head), *(_angles(eye) * _EYES for eye in (left, right))]))
-    times = np.array([(row["timestamp"] or row["time"]).number("seconds") for row in rows])
-    timing = frame_times(times, TimeSource(file_error(frames.source), seconds=True))
+    if fps is not None and not any(row["timestamp"] or row["time"] for row in rows):
+        timing = FrameTimes(fps, None)
+    else:
+        times = np.array([(row["timestamp"] or row["time"]).number("seconds") for row in rows])
+        timing = frame_times(times, TimeSource(file_error(frames.source), seconds=True))
     extras: dict[str, Any] = {}
     if turned:
         columns = torch.stack(turned)

@@ -99,7 +99,7 @@ def animation_to_weights(
     if settings.fps is not None:
         check_rate(settings.fps, "--fps", ValueRangeError)
     progress("reading the animation")
-    if (named := _named_weights(animation)) is not None:
+    if (named := _named_weights(animation, settings.fps)) is not None:
         if rate_notes(animation, named.fps, settings.fps):
             raise ValueRangeError(
                 f"--fps: found {settings.fps:g}, expected none beside weights, which {animation} has {named.rate}"
@@ -175,7 +175,7 @@ def arkit_shapes(head: Source, settings: AnimationSettings, progress: Progress) 
     return made.rig.select([name for name in made.rig.names if name in ARKIT]), list(made.notes)
 
 
-def _named_weights(path: Path) -> Take | None:
+def _named_weights(path: Path, fps: float | None) -> Take | None:
     """The weights of a recording that has weights by name and no vertices, as of Audio2Face; None of another file."""
     if path.suffix.lower() not in (".csv", *RECORDING_ENDINGS):
         return None
@@ -185,7 +185,7 @@ def _named_weights(path: Path) -> Take | None:
         first = frames[0] if isinstance(frames, list) and frames else {}
         if isinstance(first, dict) and ("vertices" in first or "geometry" in first):
             return None
-    return load_take(path)
+    return load_take(path, fps=fps)
 
 
 def _renamed(take: Take, path: Path, files: WeightFiles) -> list[str]:
