@@ -201,11 +201,33 @@ def test_frames_of_a_variable_rate_are_compared_at_their_times(folder: Path) -> 
     take = Take(30.0, weights=Track(NAMES, many[..., None]), seconds=seconds)
     save_weights_csv(take, folder / "uneven.csv")
     save_animation(load_rig(folder / "rig.glb"), take, folder / "uneven.glb")
-    save_weights_csv(replace(take, seconds=None), folder / "even.csv")
     settings = EvaluationSettings(rig=folder / "rig.glb")
     assert evaluate(folder / "uneven.csv", folder / "uneven.glb", folder / "out", settings).regions[ALL].largest < 1e-4
+
+
+def test_uneven_and_even_takes_of_one_length_are_compared_at_the_times_of_the_result(folder: Path) -> None:
+    slopes = torch.tensor([0.3, 0.2, 0.1, 0.25])
+    even = torch.arange(40, dtype=torch.float64) / 30
+    uneven = (even / even[-1]) ** 1.3 * even[-1]  # by number frames lie up to 0.1 s apart
+    for name, times, seconds in (("even", even, None), ("uneven", uneven, uneven)):
+        weights = Track(NAMES, (times[:, None] * slopes).float()[..., None])
+        save_weights_csv(Take(30.0, weights=weights, seconds=seconds), folder / f"{name}.csv")
+    save_weights_csv(
+        Take(30.0, weights=Track(NAMES, torch.zeros(40, 4, 1)), seconds=uneven + 9.0), folder / "after.csv"
+    )
+    settings = EvaluationSettings(rig=folder / "rig.glb")
+    for result, truth in (("even", "uneven"), ("uneven", "even")):
+        found = evaluate(folder / f"{result}.csv", folder / f"{truth}.csv", folder / "out", settings)
+        assert found.regions[ALL].largest < 1e-3
+        assert found.frames.tolist() == list(range(40))
+        assert any(
+            "40 of the result's 40 frames were compared, each with the truth at its time" in n for n in found.notes
+        )
+        numbered = replace(settings, by_number=True)
+        by_number = evaluate(folder / f"{result}.csv", folder / f"{truth}.csv", folder / "out", numbered)
+        assert by_number.regions[ALL].largest > 0.1
     with pytest.raises(ValueRangeError, match=r"s from the nearest; .*--by-number"):
-        evaluate(folder / "even.csv", folder / "uneven.csv", folder / "out", settings)
+        evaluate(folder / "even.csv", folder / "after.csv", folder / "out", settings)
 
 
 def test_takes_of_other_rates_are_compared_at_the_times_of_the_result(folder: Path, rig: BlendshapeRig) -> None:

@@ -151,8 +151,8 @@ def _pairs(found: AnimatedMesh, true: AnimatedMesh, settings: EvaluationSettings
         spans = [f"{int(numbers[0])} to {int(numbers[-1])}" for numbers in (rows, true_rows)]
         note = f"{len(rows)} frames at the same times were compared, {spans[0]} of the result with {spans[1]}"
         return rows, true_rows, [f"{note} of the truth"]
-    if not alike and found.count != true.count:
-        rows = torch.arange(found.count) if found.count < true.count else nearest.unique()
+    if not alike and (found.count != true.count or not even):
+        rows = torch.arange(found.count) if found.count <= true.count else nearest.unique()
         inside = (here[rows] >= there[0] - _ROUNDED) & (here[rows] <= there[-1] + _ROUNDED)  # beyond it is held still
         before, fraction = frames_beside(there, here[rows])
         true_rows = before + fraction
