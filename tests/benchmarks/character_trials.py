@@ -8,7 +8,8 @@ import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from planted.characters import UPRIGHT, Planted, packed, unpacked, write_character
+from planted.characters import UPRIGHT, Planted, write_character
+from planted.glb_files import packed, unpacked
 from torchface.geometry.similarity import similarity_transform
 from torchface.io.gltf.character_scene import Character, read_character
 from torchface.io.gltf.gltf_document import read_document

@@ -1,7 +1,5 @@
 """Characters by code: a head with a body of boxes, a skeleton, hair and materials in a ``.glb`` or ``.vrm``."""
 
-import json
-import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -11,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from planted.glb_files import packed
 from torchface.geometry.meshes.operators import components, edges, vertex_normals
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.images.image_files import encode_png
@@ -111,25 +110,6 @@ def write_character(path: Path, head: Mesh, shapes: Mapping[str, Tensor] | None 
     root |= {"accessors": buffers.accessors, "bufferViews": buffers.views, "buffers": [{"byteLength": buffers.size}]}
     path.write_bytes(packed(root, b"".join(buffers.pieces)))
     return len(vertices)
-
-
-def packed(root: Mapping[str, Any], binary: bytes, extra: bytes = b"") -> bytes:
-    """A ``.glb`` of a JSON and its binary chunk, with an unknown chunk of ``extra`` behind."""
-    text = json.dumps(root).encode()
-    text += b" " * (-len(text) % 4)
-    chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(binary), 0x004E4942) + binary
-    if extra:
-        chunks += struct.pack("<II", len(extra), 0x54534554) + extra
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
-
-
-def unpacked(path: Path) -> tuple[dict[str, Any], bytes]:
-    """The JSON and the binary chunk of a ``.glb``."""
-    data = path.read_bytes()
-    size = struct.unpack_from("<I", data, 12)[0]
-    at = 20 + size
-    length = struct.unpack_from("<I", data, at)[0]
-    return json.loads(data[20:at]), data[at + 8 : at + 8 + length]
 
 
 def box_mesh(middle: Tensor, extent: Tensor, divisions: int = 1) -> tuple[Tensor, Tensor]:

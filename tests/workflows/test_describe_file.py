@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 import torch
 
-from planted.characters import Planted, packed, unpacked, write_character
+from planted.characters import Planted, write_character
+from planted.glb_files import packed, unpacked
 from torchface import Take, Track, save_take
 from torchface.errors import FileFormatError
 from torchface.geometry.cameras.calibration import CameraCalibration

@@ -10,6 +10,7 @@ import pytest
 import torch
 from rig_samples import corrective_sheet
 
+from planted.glb_files import rewrite
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.io import save_animation, save_mesh, save_rig, save_take
 from torchface.rig import BlendshapeRig
@@ -68,16 +69,10 @@ def test_a_broken_corrective_is_an_error_and_no_rig_without_shapes(
 ) -> None:
     path = tmp_path / f"rig{ending}"
     save_rig(corrective_sheet(), path)
-    data = path.read_bytes()
     if ending == ".glb":
-        length = int.from_bytes(data[12:16], "little")
-        root = json.loads(data[20 : 20 + length])
-        root["meshes"][0]["extras"]["torchface"]["correctives"][0].update(change)
-        text = json.dumps(root).encode()
-        text += b" " * (-len(text) % 4)
-        body = len(text).to_bytes(4, "little") + b"JSON" + text + data[20 + length :]
-        path.write_bytes(data[:8] + (12 + len(body)).to_bytes(4, "little") + body)
+        rewrite(path, lambda root: root["meshes"][0]["extras"]["torchface"]["correctives"][0].update(change))
     else:
+        data = path.read_bytes()
         notes = re.search(r"string torchface = '(.*correctives.*)'$", data.decode(), re.MULTILINE)
         record = json.loads(notes[1])
         record["correctives"][0].update(change)

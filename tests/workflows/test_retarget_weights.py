@@ -6,7 +6,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from planted.characters import Planted, unpacked, write_character
+from planted.characters import Planted, write_character
+from planted.glb_files import unpacked
 from torchface import BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.cli import main
 from torchface.errors import NameMismatchError

@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from test_vrm_in_browser import browser as vrm_browser  # noqa: F401  (three-vrm's packages)
 
 from planted.characters import Planted, write_character
+from planted.glb_files import rewrite
 from torchface.io import load_rig, load_take, save_rig
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.animation_reading import read_gltf_weights
@@ -356,15 +357,8 @@ def test_eyes_that_no_shape_moves_turn_in_the_head(run: Run, tmp_path: Path) -> 
 
 def edited(data: bytes, path: Path, edit: Callable[[dict[str, Any]], None]) -> Path:
     """A ``.glb`` with its document changed."""
-    (size,) = struct.unpack("<I", data[12:16])
-    root = json.loads(data[20 : 20 + size])
-    edit(root)
-    text = json.dumps(root).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + size :]
-    head = struct.pack("<IIIII", 0x46546C67, 2, 20 + len(text) + len(rest), len(text), 0x4E4F534A)
-    path.write_bytes(head + text + rest)
-    return path
+    path.write_bytes(data)
+    return rewrite(path, edit)
 
 
 def document(path: Path, **fields: object) -> Path:

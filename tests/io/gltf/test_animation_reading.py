@@ -1,7 +1,5 @@
 """Weights that an animated file plays are those that were written, at the rate that was meant."""
 
-import json
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +8,7 @@ import torch
 from mutation import check_reader
 from rig_samples import sheet_rig, sheet_take
 
+from planted.glb_files import packed, rewrite, unpacked
 from torchface.errors import FileFormatError
 from torchface.io import save_animation, save_rig
 from torchface.io.gltf.animation_reading import read_gltf_weights
@@ -20,17 +19,12 @@ from torchface.take import Take, Track
 
 def edited(path: Path, change: dict, before: tuple[dict, ...] = (), after: tuple[dict, ...] = ()) -> Path:
     """The file with members of its one animation changed, and others before and after it."""
-    data = path.read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    root = json.loads(data[20 : 20 + length])
-    root["animations"][0].update(change)
-    root["animations"] = [*before, *root["animations"], *after]
-    text = json.dumps(root).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + length :]
-    head = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack("<I4s", len(text), b"JSON")
-    path.write_bytes(head + text + rest)
-    return path
+
+    def animate(root: dict) -> None:
+        root["animations"][0].update(change)
+        root["animations"] = [*before, *root["animations"], *after]
+
+    return rewrite(path, animate)
 
 
 @pytest.mark.parametrize("fps", [24.0, 30000 / 1001, 60.0, 120.0, 23.7])
@@ -81,19 +75,13 @@ def keyed(path: Path, way: str, seconds: torch.Tensor, keys: np.ndarray) -> Path
     rows = keys.reshape(-1, len(rig.names))
     written = torch.from_numpy(rows.copy())[..., None]
     save_animation(rig, Take(10.0, weights=Track(rig.names, written), seconds=torch.arange(len(rows)) / 10), path)
-    data = path.read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    root = json.loads(data[20 : 20 + length])
+    root, binary = unpacked(path)
     (sampler,) = root["animations"][0]["samplers"]
     where = root["bufferViews"][root["accessors"][sampler["input"]]["bufferView"]].get("byteOffset", 0)
     root["accessors"][sampler["input"]] |= {"count": len(seconds), "max": [float(seconds[-1])]}
     root["animations"][0]["samplers"] = [sampler | {"interpolation": way}]
-    text = json.dumps(root).encode()
-    text += b" " * (-len(text) % 4)
-    rest = bytearray(data[20 + length :])
-    rest[8 + where : 8 + where + 4 * len(seconds)] = seconds.float().numpy().tobytes()
-    head = struct.pack("<4sII", b"glTF", 2, 20 + len(text) + len(rest)) + struct.pack("<I4s", len(text), b"JSON")
-    path.write_bytes(head + text + rest)
+    times = seconds.float().numpy().tobytes()
+    path.write_bytes(packed(root, binary[:where] + times + binary[where + len(times) :]))
     return path
 
 

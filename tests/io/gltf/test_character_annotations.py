@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from planted.characters import Planted, packed, unpacked, write_character
+from planted.characters import Planted, write_character
+from planted.glb_files import packed, unpacked
 from torchface.errors import FileFormatError
 from torchface.io import load_mesh
 from torchface.io.gltf.character_annotations import annotate_character

@@ -1,7 +1,5 @@
 """Correctives in files: definitions in the extras, deltas as targets, weights in animations."""
 
-import json
-import struct
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,6 +8,7 @@ import pytest
 import torch
 from rig_samples import corrective_sheet, sheet_rig
 
+from planted.glb_files import packed, unpacked
 from torchface.correctives import Corrective, Correctives
 from torchface.errors import FileFormatError
 from torchface.io import load_rig, save_animation, save_rig
@@ -55,7 +54,7 @@ def test_an_animation_drives_the_correctives_and_reads_back_without_them(tmp_pat
     take = Take(60.0, weights=Track(rig.names, values))
     match = save_animation(rig, take, tmp_path / "take.glb")
     assert match.driven == rig.names
-    root, binary = _parts(tmp_path / "take.glb")
+    root, binary = unpacked(tmp_path / "take.glb")
     names = root["meshes"][0]["extras"]["targetNames"]
     accessor = root["accessors"][root["animations"][0]["samplers"][0]["output"]]
     start = root["bufferViews"][accessor["bufferView"]]["byteOffset"]
@@ -72,7 +71,7 @@ def test_an_animation_drives_the_correctives_and_reads_back_without_them(tmp_pat
 
 def test_a_rig_without_correctives_says_nothing_of_them(tmp_path: Path) -> None:
     save_rig(sheet_rig(), tmp_path / "rig.glb")
-    root, _ = _parts(tmp_path / "rig.glb")
+    root, _ = unpacked(tmp_path / "rig.glb")
     assert "correctives" not in root["meshes"][0]["extras"]["torchface"]
     assert load_rig(tmp_path / "rig.glb").correctives is None
 
@@ -102,9 +101,9 @@ def _row(**changes: Any) -> Callable[[list[Any]], None]:
 def test_broken_definitions_are_named(change: Callable[[list[Any]], None], message: str, tmp_path: Path) -> None:
     path = tmp_path / "rig.glb"
     save_rig(corrective_sheet(), path)
-    root, binary = _parts(path)
+    root, binary = unpacked(path)
     change(root["meshes"][0]["extras"]["torchface"]["correctives"])
-    _write(path, root, binary)
+    path.write_bytes(packed(root, binary))
     with pytest.raises(FileFormatError, match=message):
         load_rig(path)
 
@@ -112,22 +111,9 @@ def test_broken_definitions_are_named(change: Callable[[list[Any]], None], messa
 def test_a_long_chain_of_correctives_is_refused_at_once(tmp_path: Path) -> None:
     path = tmp_path / "rig.glb"
     save_rig(corrective_sheet(), path)
-    root, binary = _parts(path)
+    root, binary = unpacked(path)
     rows = [{"name": f"n{i}", "drivers": [f"n{i + 1}", "jawOpen"]} for i in range(20_000)]
     root["meshes"][0]["extras"]["torchface"]["correctives"] = rows
-    _write(path, root, binary)
+    path.write_bytes(packed(root, binary))
     with pytest.raises(FileFormatError, match="'n0' is driven by the corrective 'n1'"):
         load_rig(path)
-
-
-def _parts(path: Path) -> tuple[Any, bytes]:
-    data = path.read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    return json.loads(data[20 : 20 + length]), data[28 + length :]
-
-
-def _write(path: Path, root: Any, binary: bytes) -> None:
-    text = json.dumps(root).encode()
-    text += b" " * (-len(text) % 4)
-    head = b"glTF" + struct.pack("<III", 2, 28 + len(text) + len(binary), len(text)) + b"JSON"
-    path.write_bytes(head + text + struct.pack("<I", len(binary)) + b"BIN\0" + binary)

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from planted.characters import Planted, packed, unpacked, write_character
+from planted.characters import Planted, write_character
+from planted.glb_files import packed, unpacked
 from torchface.errors import TorchfaceError
 from torchface.io.gltf.character_scene import read_character
 from torchface.io.gltf.gltf_document import read_document

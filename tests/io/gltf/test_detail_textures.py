@@ -10,11 +10,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mutation import check_reader
 from PIL import Image
-from rewritten_glb import rewrite
 from rig_samples import sheet_rig
 from torch import Tensor
 
 import torchface.io.gltf.detail_textures
+from planted.glb_files import rewrite
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError
 from torchface.geometry.meshes.normal_maps import DetailMaps, decode_normals
 from torchface.io import (

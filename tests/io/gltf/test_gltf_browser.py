@@ -1,7 +1,5 @@
 """What three.js draws of our rigs in a real browser: eyes that are eyes, expressions shaded as they are shaped."""
 
-import json
-import struct
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +9,7 @@ from browser import Shot, pictures
 from test_gltf_viewers import node  # noqa: F401  (its packages)
 from torch import Tensor
 
+from planted.glb_files import rewrite
 from torchface.io import load_rig, save_mesh, save_rig
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
@@ -44,17 +43,13 @@ def shaded_apart(first: Tensor, second: Tensor) -> float:
 
 def without_turned_normals(path: Path, out: Path) -> Path:
     """The file with morph targets that carry positions alone."""
-    data = path.read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    root = json.loads(data[20 : 20 + length])
-    for mesh in root["meshes"]:
-        for primitive in mesh["primitives"]:
-            primitive["targets"] = [{"POSITION": target["POSITION"]} for target in primitive["targets"]]
-    text = json.dumps(root).encode()
-    text += b" " * (-len(text) % 4)
-    rest = data[20 + length :]
-    out.write_bytes(data[:8] + struct.pack("<II", 20 + len(text) + len(rest), len(text)) + data[16:20] + text + rest)
-    return out
+
+    def strip(root: dict[str, Any]) -> None:
+        for mesh in root["meshes"]:
+            for primitive in mesh["primitives"]:
+                primitive["targets"] = [{"POSITION": target["POSITION"]} for target in primitive["targets"]]
+
+    return rewrite(path, strip, out)
 
 
 def as_shaped(rig: BlendshapeRig, shape: str, folder: Path) -> list[Path]:

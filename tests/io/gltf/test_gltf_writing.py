@@ -1,5 +1,3 @@
-import json
-import struct
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +7,7 @@ import trimesh
 from hypothesis import given, settings
 from rig_samples import quad_sheet, rigs, sheet_rig, sheet_take
 
+from planted.glb_files import unpacked
 from torchface.errors import FileFormatError, NameMismatchError, TopologyError, ValueRangeError
 from torchface.io import load_mesh, load_rig, save_animation, save_mesh, save_rig
 from torchface.mesh import Mesh
@@ -16,12 +15,6 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 
 MICROMETRES_10 = 1e-2  # millimetres: the 1e-5 m that a round trip may cost
-
-
-def document(path: Path) -> dict:
-    data = path.read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    return json.loads(data[20 : 20 + length])
 
 
 def assert_same_mesh(found: Mesh, expected: Mesh) -> None:
@@ -87,7 +80,7 @@ def test_another_reader_finds_metres_and_the_same_surface(tmp_path: Path) -> Non
 def test_shapes_are_written_sparse_where_that_is_smaller(tmp_path: Path) -> None:
     rig = sheet_rig()
     save_rig(rig, tmp_path / "rig.glb")
-    root = document(tmp_path / "rig.glb")
+    root = unpacked(tmp_path / "rig.glb")[0]
     targets = [root["accessors"][target["POSITION"]] for target in root["meshes"][0]["primitives"][0]["targets"]]
     assert [("sparse" in target, "bufferView" in target) for target in targets] == [
         (True, False),
@@ -102,11 +95,9 @@ def test_shapes_are_written_sparse_where_that_is_smaller(tmp_path: Path) -> None
 def test_normals_are_unit_and_smooth_across_the_seam(tmp_path: Path) -> None:
     save_rig(sheet_rig(), tmp_path / "rig.glb")
     other = trimesh.load(tmp_path / "rig.glb", force="mesh", process=False)
-    data = (tmp_path / "rig.glb").read_bytes()
-    root = document(tmp_path / "rig.glb")
-    start = 28 + struct.unpack_from("<I", data, 12)[0]
+    root, data = unpacked(tmp_path / "rig.glb")
     accessor = root["accessors"][root["meshes"][0]["primitives"][0]["attributes"]["NORMAL"]]
-    offset = start + root["bufferViews"][accessor["bufferView"]]["byteOffset"]
+    offset = root["bufferViews"][accessor["bufferView"]]["byteOffset"]
     normals = np.frombuffer(data, "<f4", accessor["count"] * 3, offset).reshape(-1, 3)
     assert np.abs(np.linalg.norm(normals, axis=1) - 1).max() < 1e-6
     places = {}
@@ -123,9 +114,7 @@ def test_vertices_weld_by_movement_where_another_program_dropped_our_marks(tmp_p
     rig = BlendshapeRig(rig.neutral.with_vertices(vertices), rig.deltas, rig.names)
     save_rig(rig, tmp_path / "rig.glb")
     data = (tmp_path / "rig.glb").read_bytes()
-    length = struct.unpack_from("<I", data, 12)[0]
-    text = data[20 : 20 + length].replace(b"_VERTEX_ID", b"_ANOTHER_A")
-    (tmp_path / "other.glb").write_bytes(data[:20] + text + data[20 + length :])
+    (tmp_path / "other.glb").write_bytes(data.replace(b"_VERTEX_ID", b"_ANOTHER_A"))
     found = load_rig(tmp_path / "other.glb")
     assert len(found.neutral.vertices) == len(vertices)
     moved = torch.tensor([[0.3, 0.7, 0.2]])
@@ -140,12 +129,11 @@ def test_an_animation_carries_the_matched_weights(tmp_path: Path) -> None:
     assert match.driven == ("jawOpen", "mouthSmileLeft")
     assert match.missing == ("eyeBlinkRight",)
     assert match.unused == ("tongueOut",)
-    data, root = (tmp_path / "take.glb").read_bytes(), document(tmp_path / "take.glb")
-    start = 28 + struct.unpack_from("<I", data, 12)[0]
+    root, data = unpacked(tmp_path / "take.glb")
 
     def values(index: int) -> np.ndarray:
         accessor = root["accessors"][index]
-        offset = start + root["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        offset = root["bufferViews"][accessor["bufferView"]]["byteOffset"]
         return np.frombuffer(data, "<f4", accessor["count"], offset)
 
     sampler = root["animations"][0]["samplers"][0]

@@ -1,7 +1,5 @@
 """What meshoptimizer has packed is read as the plain file is; broken data is refused."""
 
-import json
-import struct
 from pathlib import Path
 
 import meshopt
@@ -9,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from planted.characters import packed, unpacked
+from planted.glb_files import packed, unpacked
 from torchface.errors import FileFormatError
 from torchface.io import load_rig, save_rig
 from torchface.synthetic import performer
@@ -57,12 +55,9 @@ def test_packed_vertices_are_those_of_the_plain_file(files: tuple[Path, Path]) -
 
 
 def test_broken_packed_data_is_refused(files: tuple[Path, Path], tmp_path: Path) -> None:
-    data = bytearray(files[1].read_bytes())
-    size = struct.unpack_from("<I", data, 12)[0]
-    root = json.loads(data[20 : 20 + size])
+    root, binary = unpacked(files[1])
     view = next(v for v in root["bufferViews"] if "extensions" in v)["extensions"]["EXT_meshopt_compression"]
-    at = 28 + size + view["byteOffset"]
-    data[at : at + 24] = b"\xff" * 24
-    (tmp_path / "broken.glb").write_bytes(data)
+    at = view["byteOffset"]
+    (tmp_path / "broken.glb").write_bytes(packed(root, binary[:at] + b"\xff" * 24 + binary[at + 24 :]))
     with pytest.raises(FileFormatError, match="meshopt"):
         load_rig(tmp_path / "broken.glb")

@@ -1,7 +1,5 @@
 """A head's parts as engines get them: primitives, materials, pivots, turned normals; and back as one rig."""
 
-import json
-import struct
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from planted.glb_files import packed, unpacked
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io import load_detail_maps, load_mesh, load_rig, save_animation, save_mesh, save_rig
@@ -106,16 +105,11 @@ class Written:
     """A written file's JSON and accessors."""
 
     def __init__(self, path: Path) -> None:
-        self.data = path.read_bytes()
-        length = struct.unpack_from("<I", self.data, 12)[0]
-        self.root: dict[str, Any] = json.loads(self.data[20 : 20 + length])
-        self.start = 28 + length
+        self.root, self.data = unpacked(path)
 
     def bytes(self, view: int, kind: str) -> np.ndarray:
         row = self.root["bufferViews"][view]
-        return np.frombuffer(
-            self.data, kind, row["byteLength"] // np.dtype(kind).itemsize, self.start + row["byteOffset"]
-        )
+        return np.frombuffer(self.data, kind, row["byteLength"] // np.dtype(kind).itemsize, row["byteOffset"])
 
     def rows(self, index: int) -> np.ndarray:
         accessor = self.root["accessors"][index]
@@ -309,18 +303,11 @@ def test_parts_that_another_program_edited_are_still_read(tmp_path: Path) -> Non
 
 def test_a_broken_order_of_triangles_is_no_order(tmp_path: Path) -> None:
     save_rig(head(), tmp_path / "head.glb")
-    data = (tmp_path / "head.glb").read_bytes()
-    text = data[20 : 20 + struct.unpack_from("<I", data, 12)[0]]
-    root = json.loads(text)
+    root, binary = unpacked(tmp_path / "head.glb")
     runs = root["meshes"][0]["extras"]["torchface"]["triangles"]
     for broken in ([[0, 10**12]], runs[1:], [*runs[:-1], [runs[-1][0], 10**9]], [[0, 1]] * len(runs)):
         root["meshes"][0]["extras"]["torchface"]["triangles"] = broken
-        new = json.dumps(root, separators=(",", ":")).encode()
-        new += b" " * (-len(new) % 4)
-        rest = data[20 + len(text) :]
-        (tmp_path / "b.glb").write_bytes(
-            data[:8] + struct.pack("<II", 20 + len(new) + len(rest), len(new)) + data[16:20] + new + rest
-        )
+        (tmp_path / "b.glb").write_bytes(packed(root, binary))
         assert len(load_rig(tmp_path / "b.glb").neutral.faces) == len(head().neutral.faces)
 
 

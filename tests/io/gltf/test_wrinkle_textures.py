@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 import torch
 from mutation import check_reader
-from rewritten_glb import rewrite
 from rig_samples import sheet_rig
 from test_gltf_viewers import assert_three_moves_it_alike, assert_valid, node  # noqa: F401  (its packages)
 from torch import Tensor
 
+from planted.glb_files import rewrite
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.normal_maps import normal_slopes
 from torchface.geometry.meshes.region_maps import RegionMaps

@@ -1,14 +1,13 @@
 """KTX2 images, of Face Cap's character as three.js ships it."""
 
-import json
 import random
-import struct
 import sys
 from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from planted.glb_files import unpacked
 from torchface.errors import FileFormatError
 from torchface.io import load_mesh
 from torchface.io.images.image_samples import decode_samples
@@ -19,12 +18,10 @@ pytest.importorskip("opengl_basisu", reason="opengl-basisu is not installed")
 
 @pytest.fixture(scope="module")
 def packed(data: Path) -> bytes:
-    content = (data / "characters" / "facecap.glb").read_bytes()
-    end = 20 + struct.unpack_from("<I", content, 12)[0]
-    root = json.loads(content[20:end])
+    root, binary = unpacked(data / "characters" / "facecap.glb")
     view = root["bufferViews"][root["images"][0]["bufferView"]]
-    start = end + 8 + view.get("byteOffset", 0)
-    return content[start : start + view["byteLength"]]
+    start = view.get("byteOffset", 0)
+    return binary[start : start + view["byteLength"]]
 
 
 def test_the_largest_level_is_read_with_its_first_row_on_top(packed: bytes) -> None:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from planted.characters import Planted, unpacked, write_character
+from planted.characters import Planted, write_character
+from planted.glb_files import unpacked
 from torchface.geometry.meshes.operators import border_edges
 from torchface.geometry.similarity import Similarity
 from torchface.io.gltf.character_scene import Character, read_character

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from planted.characters import Planted, box_mesh, caricature, decimated, packed, unpacked, write_character
+from planted.characters import Planted, box_mesh, caricature, decimated, write_character
+from planted.glb_files import packed, unpacked
 from torchface.cli import main
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
