@@ -8,18 +8,16 @@ from typing import Any
 import pytest
 import torch
 
-from torchface.capture import HybridSolver, MarkerSolver, WholeTakeSolver
+from torchface.capture import HybridSolver, MarkerSolver, ShapePrior, WholeTakeSolver
 from torchface.capture.energy import ridge_term, sparsity_term
-from torchface.capture.own_rig.video_settings import VideoSettings
-from torchface.capture.priors.shape_prior import ShapePrior
+from torchface.capture.own_rig import VideoSettings
 from torchface.enhancement import EnhancementSettings
 from torchface.errors import ValueRangeError
-from torchface.modeling import BakeSettings, ExpressionSettings, FitSettings
-from torchface.modeling.rigging.example_rigging import RiggingSchedule
+from torchface.modeling import BakeSettings, ExpressionSettings, FitSettings, RiggingSchedule
 from torchface.onnx import GraphSteps
-from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Level, Stage
+from torchface.registration import DEFAULT_SCHEDULE, Level, Stage
 from torchface.rig import BlendshapeRig
-from torchface.synthetic.stages.marker_stage import place_markers
+from torchface.synthetic.stages import place_markers
 
 Setting = Callable[[float], Any]
 LIKE = torch.zeros(2, 2)

@@ -18,9 +18,8 @@ from torchface.capture.action_units.classifier import group_regions
 from torchface.capture.action_units.painted_regions import performed_groups
 from torchface.errors import ValueRangeError
 from torchface.files.whole_files import make_folder
+from torchface.io import save_rig, save_take
 from torchface.io.action_labels import ActionLabels, load_action_labels
-from torchface.io.rig_files import save_rig
-from torchface.io.take_files import save_take
 from torchface.io.video import open_video
 from torchface.progress import Progress
 from torchface.rendering.compositing import headed, save_rendered_image, sheet

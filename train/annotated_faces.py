@@ -11,10 +11,9 @@ from torch import Tensor
 
 from torchface.color_space import grey_images
 from torchface.errors import FileFormatError
-from torchface.io import load_image
+from torchface.io import load_image, load_landmark_points
 from torchface.io.images.image_files import IMAGE_ENDINGS
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
-from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.progress import Progress, silent
 

@@ -6,7 +6,8 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from torchface.capture.action_units.classifier import DEFAULT_TRAINING, GroupClassifier, TrainingSettings, group_regions
+from torchface.capture.action_units import GROUPS, RegionGroup, RegionVideo, TrainingSettings
+from torchface.capture.action_units.classifier import DEFAULT_TRAINING, GroupClassifier, group_regions
 from torchface.capture.action_units.classifier_training import (
     check_training,
     group_features,
@@ -15,8 +16,6 @@ from torchface.capture.action_units.classifier_training import (
     principal_components,
 )
 from torchface.capture.action_units.one_vs_one_svm import OneVsOne
-from torchface.capture.action_units.painted_regions import GROUPS, RegionGroup
-from torchface.capture.action_units.region_video import RegionVideo
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.io.action_labels import ActionLabels
 

@@ -20,12 +20,7 @@ from torchface.enhancement.detail.low_pass import WAVELENGTH
 from torchface.errors import ValueRangeError
 from torchface.io import MeshSequence
 from torchface.workflows.animated_meshes import DEFAULT_FPS
-from torchface.workflows.enhance.coarse_animation import (
-    OWN_HEAD_MM,
-    SAMPLED,
-    distance_at_rest,
-    residual_notes,
-)
+from torchface.workflows.enhance.coarse_animation import OWN_HEAD_MM, SAMPLED, distance_at_rest, residual_notes
 
 from .captured_sequences import Capture, gather, performed, read_capture, read_pairs
 from .enhancement_figures import draw

@@ -11,8 +11,7 @@ from torchface.modeling import ExpressionRegression, transfer_deformation
 from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, headed, heat_colors, sheet
-from torchface.viz import clay_colors
-from torchface.viz.figures.face_views import frame_face
+from torchface.viz import clay_colors, frame_face
 
 from .people_samples import People
 

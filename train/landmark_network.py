@@ -16,9 +16,8 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.errors import ValueRangeError
-from torchface.landmarks import LandmarkNetwork, NetworkSettings
+from torchface.landmarks import LandmarkNetwork, NetworkLandmarks, NetworkSettings
 from torchface.landmarks.images.ibug_68 import COUNT, INNER
-from torchface.landmarks.images.networks.landmark_network import NetworkLandmarks
 from torchface.landmarks.images.networks.landmark_training import cropped, openings
 from torchface.landmarks.images.networks.picture_augmentation import AugmentationSettings, Crops
 

@@ -13,8 +13,7 @@ from torchface.capture import MarkerSolver
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY
 from torchface.shape_names import mapping
 from torchface.synthetic import performer
-from torchface.synthetic.stages.marker_stage import place_markers
-from torchface.synthetic.stages.weight_curves import perform
+from torchface.synthetic.stages import perform, place_markers
 
 from .model_cards import model_card
 from .recipe_settings import RecipeSettings

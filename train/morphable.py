@@ -11,8 +11,7 @@ from pathlib import Path
 
 from torchface import BlendshapeRig, Mesh, TorchfaceError, load_mesh, load_rig, zoo
 from torchface.errors import FileFormatError
-from torchface.io import load_ict_facekit, load_identity_modes
-from torchface.io.head_models.head_model_files import load_head_model_file
+from torchface.io import load_head_model_file, load_ict_facekit, load_identity_modes
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import submesh

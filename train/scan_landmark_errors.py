@@ -6,9 +6,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.landmarks import ScanAnnotation, ScanLandmarks
 from torchface.landmarks.scans.contours import evenly_spaced
-from torchface.landmarks.scans.scan_annotations import ScanAnnotation
-from torchface.landmarks.scans.scan_landmarks import ScanLandmarks
 from torchface.landmarks.scans.uv_landmark_names import LINES
 from torchface.mesh import Mesh
 

@@ -5,13 +5,8 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from torchface.capture.priors import (
-    ParzenDensity,
-    ReciprocalPrior,
-    ShapePrior,
-    automatic_bandwidth,
-    face_halves,
-)
+from torchface.capture import ShapePrior
+from torchface.capture.priors import ParzenDensity, ReciprocalPrior, automatic_bandwidth, face_halves
 from torchface.capture.priors.take_frames import TakeFrames
 from torchface.progress import Progress
 

@@ -12,17 +12,10 @@ import torch
 from torch import Tensor
 
 from planted.mediapipe_tracker import MediaPipeTracker
-from torchface.capture.anybody import (
-    AllAtOnce,
-    ExampleSolver,
-    WebcamControls,
-    character_matrix,
-    paper_examples,
-)
-from torchface.io import load_take, save_rig
-from torchface.io.rigs.ict_facekit import load_ict_facekit
+from torchface.capture import ExampleSolver, WebcamControls
+from torchface.capture.anybody import AllAtOnce, character_matrix, paper_examples
+from torchface.io import load_ict_facekit, load_take, save_live_link, save_rig
 from torchface.io.video import open_video
-from torchface.io.weights.live_link_csv import save_live_link
 from torchface.landmarks.images.face_mesh_478 import landmarks_of_mesh
 from torchface.progress import silent
 from torchface.rig import BlendshapeRig

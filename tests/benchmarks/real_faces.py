@@ -13,13 +13,13 @@ import torch
 from torch import Tensor
 
 from planted.landmark_measures import Agreement, agreement, find_blinks, lid_openings, mouth_gap
-from torchface.io.images.image_files import load_image
+from torchface.io import load_image, load_landmark_points
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
-from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.video import open_video
 from torchface.landmarks import (
     FaceBoxes,
     FaceReading,
+    LandmarkFinder,
     LandmarkTracker,
     NoFaceError,
     find_landmarks,
@@ -27,7 +27,6 @@ from torchface.landmarks import (
 )
 from torchface.landmarks.images.checked_detector import shipped_detector
 from torchface.landmarks.images.ibug_68 import INNER, box_around, relative_errors, tilt_around, turned_box
-from torchface.landmarks.images.landmark_finder import LandmarkFinder
 
 GROUPS = {
     "jaw": slice(0, 17),

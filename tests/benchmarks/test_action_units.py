@@ -14,9 +14,9 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch import Tensor
 
+from torchface.capture import ActionUnitClassifier, action_unit_curves
 from torchface.capture.action_units import (
     GROUPS,
-    ActionUnitClassifier,
     RegionVideo,
     TrainingSettings,
     classify,
@@ -26,7 +26,6 @@ from torchface.capture.action_units import (
 from torchface.capture.action_units.classifier import GroupClassifier, group_regions
 from torchface.capture.action_units.classifier_training import label_group
 from torchface.capture.action_units.painted_pattern import Method
-from torchface.capture.action_units.weight_targets import action_unit_curves
 from torchface.io.action_labels import ActionLabels, load_action_labels
 from torchface.io.video import open_video
 from torchface.landmarks.scans.hog import HogLayout, cell_map

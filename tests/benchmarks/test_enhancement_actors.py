@@ -12,8 +12,7 @@ from torch import Tensor
 
 from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.enhancement.detail.low_pass import LowPass
-from torchface.synthetic.head.identity import IDENTITY
-from torchface.synthetic.head.performer import performer
+from torchface.synthetic import IDENTITY, performer
 from torchface.synthetic.stages.wrinkles import WrinkledPerformer
 from torchface.synthetic.stages.wrinkles.wrinkled_performer import captured_skin
 

@@ -32,20 +32,13 @@ from torch import Tensor
 from planted.photographed_heads import aligned_error
 from torchface import zoo
 from torchface.geometry.cameras.pnp import solve_pnp
-from torchface.io.images.image_files import load_image
+from torchface.io import load_identity_modes, load_image, load_landmark_points
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
-from torchface.io.landmarks.landmark_points import load_landmark_points
-from torchface.io.rigs.ict_facekit import load_identity_modes
 from torchface.modeling import FitSettings, HeadModel, fit_images
 from torchface.modeling.photographs.fit_problem import Problem, State
 from torchface.modeling.photographs.image_fit import contour_curves
 from torchface.modeling.photographs.image_solve import solve
-from torchface.modeling.photographs.landmark_view import (
-    JAW,
-    LandmarkSites,
-    LinearPoints,
-    Views,
-)
+from torchface.modeling.photographs.landmark_view import JAW, LandmarkSites, LinearPoints, Views
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.workflows.named_priors import DEFAULT_PRIOR, load_priors

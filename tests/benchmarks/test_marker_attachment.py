@@ -11,8 +11,7 @@ from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import MarkerSolver, align_take, fit_attachment, rest_residual
 from torchface.geometry.similarity import Similarity
 from torchface.synthetic import performer
-from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
-from torchface.synthetic.stages.weight_curves import perform
+from torchface.synthetic.stages import StageFlaws, perform, place_markers, record
 
 Capture = tuple[BlendshapeRig, Attachment, list[Tensor]]
 

@@ -20,8 +20,7 @@ from safetensors.torch import load_file
 from sklearn.decomposition import PCA
 from torch import Tensor
 
-from torchface.io import load_identity_modes
-from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
+from torchface.io import MeshSequence, MeshSequenceWriter, load_identity_modes
 from torchface.modeling import MorphableModel
 
 SAMPLES = int(os.environ.get("TORCHFACE_BENCH_SAMPLES", "10000"))

@@ -11,15 +11,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.io import load_mesh, load_take
-from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
+from torchface.io import load_ict_facekit, load_identity_modes, load_mesh, load_take
 from torchface.modeling import InnerParts, inner_parts, place_parts, shape_depths, transfer_with_report
 from torchface.modeling.rigging.penetration import TOLERANCE
 from torchface.registration import in_place_of, register
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
-from torchface.synthetic.head.identity import IDENTITY
-from torchface.synthetic.head.performer import performer
+from torchface.synthetic import IDENTITY, performer
 
 HEADS, FRAMES = 20, 100
 SHELLS = 1.2

@@ -4,11 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from torchface.io import load_identity_modes, load_mesh
-from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.io import load_identity_modes, load_landmark_points, load_mesh
 from torchface.registration import register
 from torchface.rendering.compositing import save_rendered_image
-from torchface.viz.figures.registration_views import registration_sheet
+from torchface.viz import registration_sheet
 
 OUT = Path(__file__).parents[2] / "out" / "registration"
 PARTS = {"brows": slice(17, 27), "nose": slice(27, 36), "eyes": slice(36, 48), "mouth": slice(48, 68)}

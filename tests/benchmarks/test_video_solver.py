@@ -31,14 +31,9 @@ from video_solver_cases import (
     with_correctives,
 )
 
-from torchface.capture.own_rig import VideoSolver
+from torchface.capture import DynamicsPrior, DynamicsSettings, ShapePrior, VideoSolver
 from torchface.capture.own_rig.state_estimate import Expectation, StateEstimate
-from torchface.capture.priors import (
-    DynamicsPrior,
-    DynamicsSettings,
-    ShapePrior,
-)
-from torchface.io.rigs.ict_facekit import load_identity_modes
+from torchface.io import load_identity_modes
 from torchface.modeling import transfer_deformation
 from torchface.optim.prepared_program import PreparedProgram
 

@@ -10,8 +10,7 @@ from typing import TypeVar
 import pytest
 import torch
 
-from torchface.modeling.detail.normal_map_baking import bake_normal_map
-from torchface.modeling.detail.scan_alignment import align_scan
+from torchface.modeling import align_scan, bake_normal_map
 
 T = TypeVar("T")
 

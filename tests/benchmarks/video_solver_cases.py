@@ -10,13 +10,10 @@ from image_fit_cases import Faces
 from torch import Tensor
 
 from planted.gaussian_density import gaussian
-from torchface.capture.own_rig import VideoSettings, VideoSolver, solve_whole_take
+from torchface.capture import DynamicsPrior, ShapePrior, VideoSolver
+from torchface.capture.own_rig import VideoSettings, solve_whole_take
 from torchface.capture.own_rig.face_points import FacePoints
-from torchface.capture.priors import (
-    DynamicsPrior,
-    ReciprocalPrior,
-    ShapePrior,
-)
+from torchface.capture.priors import ReciprocalPrior
 from torchface.geometry.rotations import rotation_matrix
 from torchface.rig import BlendshapeRig
 

@@ -6,8 +6,7 @@ import torch
 from torchface import Attachment, BlendshapeRig, Mesh
 from torchface.geometry.similarity import Similarity
 from torchface.synthetic import performer
-from torchface.synthetic.stages.marker_stage import place_markers
-from torchface.synthetic.stages.weight_curves import perform
+from torchface.synthetic.stages import perform, place_markers
 
 
 @pytest.fixture(scope="session")

@@ -10,8 +10,7 @@ from PIL import Image
 
 from torchface import zoo
 from torchface.cli import main
-from torchface.io import load_mesh, save_mesh, save_rig
-from torchface.io.landmarks.picks import Correspondences, save_correspondences
+from torchface.io import Correspondences, load_mesh, save_correspondences, save_mesh, save_rig
 from torchface.mesh import Mesh
 from torchface.modeling import MorphableModel
 from torchface.rig import BlendshapeRig

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig
-from torchface.capture import MarkerSolver
-from torchface.capture.own_rig import VideoSolver
+from torchface.capture import MarkerSolver, VideoSolver
 from torchface.enhancement.wrinkle_maps.wrinkle_weights import RigWrinkles, WrinkleWeights
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.landmarks import DetectorSettings, LandmarkTrees, TreeSettings, UVLandmarkDetector

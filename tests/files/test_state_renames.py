@@ -13,16 +13,10 @@ import torch
 from torch import Tensor, nn
 
 from torchface import zoo
+from torchface.capture import ActionUnitClassifier, DynamicsPrior, DynamicsSettings, ShapePrior
 from torchface.capture.action_units import RegionGroup
-from torchface.capture.action_units.classifier import ActionUnitClassifier, GroupSize
-from torchface.capture.priors import (
-    DynamicsPrior,
-    DynamicsSettings,
-    ParzenDensity,
-    ReciprocalPrior,
-    ShapePrior,
-    StudentDensity,
-)
+from torchface.capture.action_units.classifier import GroupSize
+from torchface.capture.priors import ParzenDensity, ReciprocalPrior, StudentDensity
 from torchface.errors import FileFormatError
 from torchface.files.models import CARD, DESCRIPTION, STATE, read_record, write_model
 from torchface.files.state_renames import CONFIG_RENAMES, STATE_RENAMES, current_config, current_state_keys

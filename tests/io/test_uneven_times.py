@@ -10,9 +10,8 @@ from rig_samples import sheet_rig
 
 from torchface import Take, Track, load_take, save_take
 from torchface.errors import FileFormatError, ValueRangeError
-from torchface.io import load_animation, save_animation
+from torchface.io import load_animation, save_animation, save_live_link
 from torchface.io.landmarks.landmark_tables import load_landmark_table
-from torchface.io.weights.live_link_csv import save_live_link
 from torchface.shape_names import ARKIT
 
 KINDS = ("variable rate", "dropped frames", "one long gap")

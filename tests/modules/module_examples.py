@@ -10,33 +10,32 @@ from torch import Tensor, nn
 
 from planted.planted_correctives import planted_correctives
 from torchface import Attachment, BlendshapeRig
-from torchface.capture import HelmetSolver, HybridSolver, MarkerSolver, WholeTakeSolver
-from torchface.capture.action_units.classifier import ActionUnitClassifier, GroupSize
-from torchface.capture.action_units.painted_regions import RegionGroup
-from torchface.capture.anybody import ExampleSolver, WebcamSolver
-from torchface.capture.anybody.examples.example_shapes import ExampleShapes
-from torchface.capture.anybody.examples.landmark_model import LandmarkModel
-from torchface.capture.anybody.webcam_state import WebcamControls
-from torchface.capture.own_rig import VideoSettings, VideoSolver
-from torchface.capture.priors import (
-    AdaptedDynamicsPrior,
+from torchface.capture import (
+    ActionUnitClassifier,
     DynamicsPrior,
     DynamicsSettings,
-    ReciprocalPrior,
+    ExampleSolver,
+    HelmetSolver,
+    HybridSolver,
+    MarkerSolver,
     ShapePrior,
+    VideoSolver,
+    WebcamControls,
+    WebcamSolver,
+    WholeTakeSolver,
 )
+from torchface.capture.action_units import RegionGroup
+from torchface.capture.action_units.classifier import GroupSize
+from torchface.capture.anybody import ExampleShapes, LandmarkModel
+from torchface.capture.own_rig import VideoSettings
+from torchface.capture.priors import AdaptedDynamicsPrior, ReciprocalPrior
 from torchface.enhancement import CapturedPerformance, EnhancementModel
 from torchface.enhancement.wrinkle_maps.wrinkle_weights import WrinkleWeights
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.similarity import Similarity
-from torchface.landmarks.images.boxes.box_network import BoxNetwork
-from torchface.landmarks.images.networks.eye_network import EyeNetwork
-from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
+from torchface.landmarks import BoxNetwork, EyeNetwork, LandmarkNetwork, LandmarkTrees
 from torchface.landmarks.images.networks.part_network import PartNetwork
-from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
-from torchface.modeling import ExpressionRegression, ExpressionSettings
-from torchface.modeling.morphable.head_model import HeadModel
-from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.modeling import ExpressionRegression, ExpressionSettings, HeadModel, MorphableModel
 from torchface.onnx import SolverGraph
 from torchface.optim import BoxQP, FixedSplitting, ProjectedGradient
 from torchface.synthetic import performer

@@ -12,15 +12,9 @@ from torchface.capture import HybridSolver, MarkerSolver
 from torchface.correctives import Corrective, Correctives
 from torchface.errors import ValueRangeError
 from torchface.landmarks.images.graph_session import graph_session
+from torchface.onnx import SolverGraph, export_solver
 from torchface.onnx.corrective_graph import CorrectiveGraph
-from torchface.onnx.solver_graph import SolverGraph
-from torchface.onnx.solver_graph_export import (
-    export_marker_solver,
-    export_solver,
-    hide_markers,
-    random_frames,
-    solver_model,
-)
+from torchface.onnx.solver_graph_export import export_marker_solver, hide_markers, random_frames, solver_model
 from torchface.synthetic import performer
 
 

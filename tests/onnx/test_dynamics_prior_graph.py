@@ -13,7 +13,7 @@ from torchface.capture import DynamicsPrior, DynamicsSettings
 from torchface.errors import ValueRangeError
 from torchface.onnx import ExportReport, export_model
 from torchface.onnx import dynamics_prior_graph as exporting
-from torchface.synthetic.stages.weight_curves import perform
+from torchface.synthetic.stages import perform
 
 
 @pytest.fixture(scope="module", params=[1, 4])

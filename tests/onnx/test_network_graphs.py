@@ -9,9 +9,8 @@ import pytest
 import torch
 
 from torchface import zoo
-from torchface.landmarks import BoxNetwork
+from torchface.landmarks import BoxNetwork, EyeNetwork
 from torchface.landmarks.images.boxes import box_network
-from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.onnx import export_model
 from torchface.onnx.network_graphs import FACE_VALUES
 

@@ -16,14 +16,9 @@ from torch import Tensor
 from torchface import Attachment, BlendshapeRig, __version__
 from torchface.capture import HybridSolver, MarkerSolver
 from torchface.errors import ValueRangeError
-from torchface.onnx import SolverReport, export_model, export_solver, solver_graph_export
-from torchface.onnx.solver_graph_export import (
-    GraphSteps,
-    hide_markers,
-    random_frames,
-    solver_graph,
-)
-from torchface.synthetic.stages.marker_stage import place_markers
+from torchface.onnx import GraphSteps, SolverReport, export_model, export_solver, solver_graph_export
+from torchface.onnx.solver_graph_export import hide_markers, random_frames, solver_graph
+from torchface.synthetic.stages import place_markers
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "solve_onnx.py"
 # Importing torch would defeat the example's point, so it is made impossible.

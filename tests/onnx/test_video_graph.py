@@ -11,14 +11,14 @@ import torch
 from torch import Tensor, nn
 
 from torchface import __version__
-from torchface.capture.own_rig import VideoSettings, VideoSolver
-from torchface.capture.priors import DynamicsPrior, DynamicsSettings, ParzenDensity, ShapePrior
+from torchface.capture import DynamicsPrior, DynamicsSettings, ShapePrior, VideoSolver
+from torchface.capture.own_rig import VideoSettings
+from torchface.capture.priors import ParzenDensity
 from torchface.cli import main
 from torchface.correctives import Corrective, Correctives
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
-from torchface.io import save_rig
-from torchface.io.camera_files import save_calibration
+from torchface.io import save_calibration, save_rig
 from torchface.onnx import VideoGraph, VideoReport, export_video_solver
 from torchface.onnx import video_graph_export as video_export
 from torchface.onnx.exported_model import exported_model

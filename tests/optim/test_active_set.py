@@ -7,11 +7,7 @@ from torchface.errors import ValueRangeError
 from torchface.optim.active_set import primal_dual_active_set, projected_newton
 from torchface.optim.box_problem import BoxProblem, metric
 from torchface.optim.free_variables import solve_free
-from torchface.optim.operator_splitting import (
-    prepare_splitting,
-    splitting_steps,
-    start_splitting,
-)
+from torchface.optim.operator_splitting import prepare_splitting, splitting_steps, start_splitting
 
 
 def problem(variables: int = 12, problems: int = 30, seed: int = 0) -> BoxProblem:

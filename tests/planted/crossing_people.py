@@ -7,8 +7,7 @@ from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.rendering.clay_shading import Lighting, render
-from torchface.synthetic import performer
-from torchface.synthetic.head.identity import IDENTITY
+from torchface.synthetic import IDENTITY, performer
 
 FPS = 30
 _WALL = (0.3, 0.35, 0.4)

@@ -13,8 +13,7 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.video import open_video
 from torchface.mesh import Mesh
 from torchface.rendering.point_light import PointLight, in_camera_frame
-from torchface.synthetic import performer
-from torchface.synthetic.head.neutral_head import neutral_head
+from torchface.synthetic import neutral_head, performer
 
 PLAIN = LightStageSettings(width=120, height=120, samples=1, gloss=0.0, noise=0.0)
 AMBIENT, INTENSITY = torch.tensor([0.2, 0.3, 0.4]), torch.tensor([0.5, 0.6, 0.7])

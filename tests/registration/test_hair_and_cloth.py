@@ -9,12 +9,11 @@ from torch import Tensor
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.similarity import Similarity
 from torchface.mesh import Mesh
-from torchface.registration import Registration, register
+from torchface.registration import DEFAULT_SCHEDULE, Registration, Schedule, register
 from torchface.registration.hair_and_cloth import find_ears
-from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Schedule
 from torchface.registration.scan_colors import without_colors
 from torchface.registration.scan_completion import completed_colors, completed_form
-from torchface.synthetic.head.performer import performer
+from torchface.synthetic import performer
 
 SKIN, HAIR = (0.75, 0.55, 0.45), (0.05, 0.04, 0.03)
 LIFT = 9.0

@@ -10,10 +10,9 @@ import torch
 from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.mirrored_points import check_mirrored
-from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.io import load_landmark_points
 from torchface.mesh import Mesh
-from torchface.registration import register
-from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Level, Schedule, Stage
+from torchface.registration import DEFAULT_SCHEDULE, Level, Schedule, Stage, register
 from torchface.registration.scan_preparation import check_landmarks, check_same_hand, prepare_scan
 from torchface.synthetic import performer
 

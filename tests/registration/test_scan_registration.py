@@ -13,8 +13,7 @@ from torch import Tensor
 from torchface.errors import AlignmentError
 from torchface.geometry.meshes.operators import triangle_cross
 from torchface.geometry.meshes.surface_index import SurfaceIndex
-from torchface.io import load_identity_modes, load_mesh, load_rig
-from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.io import load_identity_modes, load_landmark_points, load_mesh, load_rig
 from torchface.mesh import Mesh
 from torchface.registration import DEFAULT_SCHEDULE, Level, Registration, Schedule, Stage, register
 from torchface.registration.scan_preparation import Landmarks

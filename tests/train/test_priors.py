@@ -13,8 +13,7 @@ from torchface.capture.priors import ReciprocalPrior
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TorchfaceError, ValueRangeError
 from torchface.shape_names import mapping
 from torchface.synthetic import performer
-from torchface.synthetic.stages.marker_stage import place_markers
-from torchface.synthetic.stages.weight_curves import perform
+from torchface.synthetic.stages import perform, place_markers
 from torchface.take import Track
 from train import prior_takes
 from train.prior_takes import read_takes, renamed, split, synthetic_takes

@@ -12,8 +12,7 @@ from planted.glb_files import packed, unpacked
 from torchface import Take, Track, save_take
 from torchface.errors import FileFormatError
 from torchface.geometry.cameras.calibration import CameraCalibration
-from torchface.io import save_calibration, save_mesh, save_rig
-from torchface.io.landmarks.landmark_points import save_pts
+from torchface.io import save_calibration, save_mesh, save_pts, save_rig
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import neutral_head

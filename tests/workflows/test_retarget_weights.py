@@ -11,8 +11,7 @@ from planted.glb_files import unpacked
 from torchface import BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.cli import main
 from torchface.errors import NameMismatchError
-from torchface.io import load_animation
-from torchface.io.images.image_files import load_image
+from torchface.io import load_animation, load_image
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.synthetic import performer
 from torchface.workflows.retarget_weights import retarget_weights

@@ -24,8 +24,7 @@ from torchface import BlendshapeRig, TorchfaceError, zoo
 from torchface.capture import MarkerSolver
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.landmarks import UVLandmarkDetector
-from torchface.modeling.morphable.head_model import HeadModel
-from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.modeling import HeadModel, MorphableModel
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

@@ -14,8 +14,7 @@ import pytest
 import torch
 
 from torchface import zoo
-from torchface.capture import MarkerSolver
-from torchface.capture.priors import ShapePrior
+from torchface.capture import MarkerSolver, ShapePrior
 from torchface.errors import FileFormatError, MissingExtraError, NameMismatchError
 
 COMMIT = "1" * 40

@@ -10,10 +10,9 @@ import pytest
 import torch
 
 from torchface import zoo
-from torchface.capture import MarkerSolver
-from torchface.capture.priors import ShapePrior
+from torchface.capture import MarkerSolver, ShapePrior
 from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.modeling import MorphableModel
 
 REPOSITORY = Path(__file__).resolve().parents[2]
 

@@ -15,10 +15,9 @@ from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
-from torchface.synthetic.head.drawn_identities import draw_identities
+from torchface.synthetic import IDENTITY, draw_identities, performer
 from torchface.synthetic.head.head_annotations import head_annotations
-from torchface.synthetic.head.identity import IDENTITY, ramp, sculpted_vertices
-from torchface.synthetic.head.performer import performer
+from torchface.synthetic.head.identity import ramp, sculpted_vertices
 from torchface.synthetic.stages.weight_curves import GESTURES
 
 from .backdrops import backdrop, photographed, uniform

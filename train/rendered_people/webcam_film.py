@@ -15,8 +15,7 @@ from torch import Tensor
 from torchface.errors import ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder, write_file
-from torchface.io import load_take
-from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
+from torchface.io import load_ict_facekit, load_identity_modes, load_take
 from torchface.io.video import open_video, write_video
 from torchface.progress import Progress
 from torchface.shape_names import ARKIT, mapping

@@ -9,14 +9,12 @@ import pytest
 import torch
 
 from torchface import zoo
-from torchface.capture import CurveSettings
+from torchface.capture import ActionUnitClassifier, CurveSettings, action_unit_curves
 from torchface.capture.action_units import (
     GROUPS,
-    ActionUnitClassifier,
     RegionGroup,
     RegionVideo,
     TrainingSettings,
-    action_unit_curves,
     classify,
     load_shape_table,
     read_regions,

@@ -11,11 +11,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from torchface.capture.own_rig.head_pose import (
-    STABLE_LANDMARKS,
-    HeadPoses,
-    measure_poses,
-)
+from torchface.capture.own_rig.head_pose import STABLE_LANDMARKS, HeadPoses, measure_poses
 from torchface.errors import AlignmentError, ShapeError
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.geometry.cameras.pnp import pixel_jacobian, solve_pnp

@@ -8,13 +8,11 @@ import torch
 from torch import Tensor
 
 from torchface import zoo
-from torchface.capture.own_rig import VideoSettings, VideoSolver
-from torchface.capture.own_rig.face_measurements import FaceMeasurements
+from torchface.capture import ShapePrior, VideoSolver, WeightReadings
+from torchface.capture.own_rig import FaceMeasurements, VideoSettings
 from torchface.capture.own_rig.face_points import FacePoints
 from torchface.capture.own_rig.landmark_offset_estimate import estimate_offsets
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets, shifted_points
-from torchface.capture.priors import ShapePrior
-from torchface.capture.weight_readings import WeightReadings
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import similarity_transform

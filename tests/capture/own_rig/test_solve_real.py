@@ -5,10 +5,8 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchface.capture.own_rig import VideoSolver
-from torchface.capture.priors import ShapePrior
-from torchface.io import load_rig, load_take, save_animation
-from torchface.io.rigs.ict_facekit import load_identity_modes
+from torchface.capture import ShapePrior, VideoSolver
+from torchface.io import load_identity_modes, load_rig, load_take, save_animation
 from torchface.modeling import FitSettings, HeadModel, MorphableModel, fit_images
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, save_rendered_image, sheet

@@ -7,14 +7,8 @@ from scipy.stats import multivariate_t
 from sklearn.cluster import estimate_bandwidth
 from torch import Tensor
 
-from torchface.capture.priors import (
-    ParzenDensity,
-    ReciprocalPrior,
-    ShapePrior,
-    StudentDensity,
-    automatic_bandwidth,
-    face_halves,
-)
+from torchface.capture import ShapePrior
+from torchface.capture.priors import ParzenDensity, ReciprocalPrior, StudentDensity, automatic_bandwidth, face_halves
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 
 NAMES = ("browInnerUp", "eyeBlinkLeft", "jawOpen", "mouthPucker", "mouthClose")

@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from torchface.correctives import Corrective
-from torchface.io import load_animation, load_mesh, load_rig, save_rig
-from torchface.io.images.image_files import save_image
+from torchface.io import load_animation, load_mesh, load_rig, save_image, save_rig
 
 pytestmark = pytest.mark.usefixtures("same_process")
 

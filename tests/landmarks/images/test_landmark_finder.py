@@ -8,14 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.landmarks import (
-    FaceBoxes,
-    FaceReading,
-    LandmarkTracker,
-    NoFaceError,
-    find_landmarks,
-    track_landmarks,
-)
+from torchface.landmarks import FaceBoxes, FaceReading, LandmarkTracker, NoFaceError, find_landmarks, track_landmarks
 from torchface.landmarks.images.face_reading import trust_of
 from torchface.landmarks.images.ibug_68 import box_around, tilt_around, turned_box
 from torchface.synthetic import performer

@@ -10,10 +10,8 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.landmarks import LineExamples
-from torchface.landmarks.scans.detector_settings import DetectorSettings
+from torchface.landmarks import DetectorSettings, LineExamples, UVLandmarkDetector
 from torchface.landmarks.scans.hog import HogLayout
-from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
 
 NAMES = ("cross", "ring", "corner")
 SETTINGS = DetectorSettings(hog=HogLayout(stride=4), responses=50)

@@ -16,8 +16,7 @@ from torchface.geometry.meshes.tangent_space import from_tangent_space, tangent_
 from torchface.geometry.similarity import Similarity
 from torchface.io import load_rig
 from torchface.mesh import Mesh, submesh
-from torchface.modeling.detail.normal_map_baking import BakeSettings, NormalMap, bake_normal_map, detail_maps
-from torchface.modeling.detail.scan_alignment import align_scan
+from torchface.modeling import BakeSettings, NormalMap, align_scan, bake_normal_map, detail_maps
 
 DEPTH, WIDTH = 0.3, 2.0
 SIZE = 256

@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from torchface.modeling.morphable.head_model import HeadModel
-from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.modeling import HeadModel, MorphableModel
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.head.identity import anatomy

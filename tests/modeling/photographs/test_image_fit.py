@@ -14,19 +14,12 @@ from torchface.errors import ShapeError
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.landmarks.images.ibug_68 import as_annotated
-from torchface.modeling.morphable.head_model import HeadModel
+from torchface.modeling import FitSettings, HeadModel, ImageFit, fit_images, transfer_deformation
 from torchface.modeling.photographs.fit_problem import Problem
-from torchface.modeling.photographs.fit_settings import FitSettings, SurfacePoints
-from torchface.modeling.photographs.image_fit import (
-    ImageFit,
-    contour_curves,
-    fit_images,
-    smooth_differences,
-    with_whole_eyeballs,
-)
+from torchface.modeling.photographs.fit_settings import SurfacePoints
+from torchface.modeling.photographs.image_fit import contour_curves, smooth_differences, with_whole_eyeballs
 from torchface.modeling.photographs.image_input import annotated_vertices
 from torchface.modeling.photographs.landmark_view import LandmarkSites, LinearPoints
-from torchface.modeling.rigging.deformation_transfer import transfer_deformation
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, neutral_head, performer
 

@@ -11,15 +11,10 @@ from planted.photographed_heads import SIZE, person
 from torchface.attachment import Attachment
 from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.cameras.pinhole import look_at
-from torchface.io.images.image_files import load_image
+from torchface.io import load_identity_modes, load_image, load_landmark_points
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
-from torchface.io.landmarks.landmark_points import load_landmark_points
-from torchface.io.rigs.ict_facekit import load_identity_modes
 from torchface.mesh import Mesh
-from torchface.modeling.morphable.head_model import HeadModel
-from torchface.modeling.morphable.morphable_model import MorphableModel
-from torchface.modeling.photographs.fit_settings import FitSettings
-from torchface.modeling.photographs.image_fit import fit_images
+from torchface.modeling import FitSettings, HeadModel, MorphableModel, fit_images
 from torchface.rig import BlendshapeRig
 
 

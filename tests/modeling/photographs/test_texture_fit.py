@@ -11,10 +11,8 @@ from torchface.errors import AlignmentError, ShapeError, TopologyError
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.mesh import Mesh
-from torchface.modeling.morphable.morphable_model import MorphableModel
+from torchface.modeling import MorphableModel, PhotoTexture, fit_colors, photo_texture
 from torchface.modeling.photographs.skin_mask import FacePlaces, ShownParts
-from torchface.modeling.photographs.texture_fit import fit_colors
-from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import neutral_head
 from train.rendered_people.complexion import complexion_colors, draw_complexions

@@ -10,8 +10,7 @@ from planted.characters import caricature
 from torchface.cli import main
 from torchface.errors import TopologyError
 from torchface.geometry.similarity import similarity_transform
-from torchface.io import load_rig, save_mesh, save_rig
-from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
+from torchface.io import load_ict_facekit, load_identity_modes, load_rig, save_mesh, save_rig
 from torchface.mesh import Mesh
 from torchface.modeling import neutral_notes
 from torchface.modeling.rigging.neutral_check import pose_notes

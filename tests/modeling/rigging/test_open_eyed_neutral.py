@@ -4,8 +4,7 @@ import pytest
 import torch
 
 from torchface.errors import NameMismatchError, TopologyError
-from torchface.modeling.rigging.deformation_transfer import transfer_with_report
-from torchface.modeling.rigging.open_eyed_neutral import open_eyes
+from torchface.modeling import open_eyes, transfer_with_report
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 

@@ -7,15 +7,9 @@ import torch
 from onnx import ModelProto
 from torch import Tensor, nn
 
-from torchface.landmarks import BoxNetwork, LandmarkNetwork
-from torchface.landmarks.images.frame_reader.face_reader import (
-    STATE,
-    FaceReader,
-    ReaderSettings,
-    WebcamNetworks,
-)
+from torchface.landmarks import BoxNetwork, EyeNetwork, LandmarkNetwork
+from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader, ReaderSettings, WebcamNetworks
 from torchface.landmarks.images.frame_reader.picture_pieces import cut_square, whole_picture
-from torchface.landmarks.images.networks.eye_network import EyeNetwork
 from torchface.onnx.exported_model import exported_model
 from torchface.onnx.webcam.webcam_model import (
     OUTPUTS,

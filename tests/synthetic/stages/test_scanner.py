@@ -11,16 +11,15 @@ from planted.scan_files import write_scans
 from torchface.errors import ValueRangeError
 from torchface.geometry.meshes.operators import border_vertices, components, triangle_normals
 from torchface.geometry.meshes.surface_index import SurfaceIndex
-from torchface.io import load_mesh
-from torchface.io.landmarks.landmark_points import load_landmark_points
-from torchface.landmarks.scans.scan_annotations import load_annotations
-from torchface.landmarks.scans.uv_landmark_names import LINES, UV_LANDMARK_NAMES, uv_landmarks_from_ibug
+from torchface.io import load_landmark_points, load_mesh
+from torchface.landmarks import UV_LANDMARK_NAMES, load_annotations, uv_landmarks_from_ibug
+from torchface.landmarks.scans.uv_landmark_names import LINES
 from torchface.mesh import Mesh
 from torchface.rendering.clay_shading import sample_texture
 from torchface.synthetic import performer
-from torchface.synthetic.stages import scanner
+from torchface.synthetic.stages import RawScan, ScannerSettings, eyes_closed, scan_head, scanner
 from torchface.synthetic.stages.depth_fusion import DepthNoise, fuse, surface_net
-from torchface.synthetic.stages.scanner import Dress, Photography, RawScan, ScannerSettings, eyes_closed, scan_head
+from torchface.synthetic.stages.scanner import Dress, Photography
 from torchface.synthetic.stages.subdivision import catmull_clark, finely_coloured
 
 COARSE = ScannerSettings(voxel=3.0, detail=3.0, photography=Photography(height=200))

@@ -5,8 +5,7 @@ import torch
 
 from torchface.attachment import Attachment
 from torchface.errors import ValueRangeError
-from torchface.io import load_mesh, load_rig
-from torchface.io.landmarks.picks import load_correspondences, load_landmarks
+from torchface.io import load_correspondences, load_landmarks, load_mesh, load_rig
 from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig
 from torchface.viz.browser.landmark_sets import IBUG_68, THESIS_12, custom_set

@@ -9,8 +9,7 @@ import torch
 from torchface.errors import ValueRangeError
 from torchface.mesh import Mesh, submesh
 from torchface.progress import silent
-from torchface.synthetic import draw_identities, neutral_head, performer
-from torchface.synthetic.head.embedded_character import character
+from torchface.synthetic import character, draw_identities, neutral_head, performer
 from torchface.workflows.enhance.head_correspondence import find_correspondence
 
 

@@ -10,9 +10,8 @@ from torch import Tensor
 from torchface.capture.anybody import ExampleShapes, paper_examples, paper_expressions
 from torchface.cli import main
 from torchface.errors import NameMismatchError
-from torchface.io import save_rig
-from torchface.io.images.image_files import save_image
-from torchface.io.video.video_writing import write_video
+from torchface.io import save_image, save_rig
+from torchface.io.video import write_video
 from torchface.landmarks import FaceReading, NoFaceError
 from torchface.synthetic import performer
 from torchface.workflows.examples import guided_session, picture_examples

@@ -9,12 +9,9 @@ import torch
 from torch import Tensor
 
 from torchface import load_rig, zoo
-from torchface.errors import (
-    AlignmentError,
-)
+from torchface.errors import AlignmentError
 from torchface.geometry.cameras.pinhole import look_at
-from torchface.io import load_identity_modes
-from torchface.io.images.image_files import load_image, save_image
+from torchface.io import load_identity_modes, load_image, save_image
 from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer

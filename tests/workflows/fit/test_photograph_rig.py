@@ -10,17 +10,9 @@ from planted.photographed_heads import aligned_error
 from torchface import load_rig, save_rig, zoo
 from torchface.cli import main
 from torchface.color_space import to_linear
-from torchface.errors import (
-    FileFormatError,
-    NameMismatchError,
-    ShapeError,
-    TopologyError,
-    ValueRangeError,
-)
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.cameras.pinhole import look_at
-from torchface.io.camera_files import load_calibration
-from torchface.io.images.image_files import load_image, save_image
-from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.io import load_calibration, load_image, load_landmark_points, save_image
 from torchface.io.video import write_video
 from torchface.landmarks import FaceReading, NoFaceError, find_faces
 from torchface.modeling import FitSettings, HeadModel, MorphableModel, fit_images

@@ -10,8 +10,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from torchface.io.images.image_files import load_image
-from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.io import load_image, load_landmark_points
 from torchface.workflows.fit.sharpness_checks import blockiness, resolved_points, sharpness_lines
 
 SIZE, EYES = 240, 100.0

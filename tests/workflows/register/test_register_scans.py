@@ -17,11 +17,9 @@ import torch
 
 from torchface.errors import FileFormatError, MissingExtraError, ShapeError, TopologyError, ValueRangeError
 from torchface.files import content_keys
-from torchface.io import load_image, load_mesh, save_mesh
-from torchface.io.landmarks.picks import Correspondences, save_correspondences
+from torchface.io import Correspondences, load_image, load_mesh, save_correspondences, save_mesh
 from torchface.mesh import Annotations, Mesh
-from torchface.registration import Level, Schedule, Stage, register
-from torchface.registration.landmark_files import load_scan_landmarks
+from torchface.registration import Level, Schedule, Stage, load_scan_landmarks, register
 from torchface.registration.model_fit import LinearShape
 from torchface.workflows.batch.batch_items import BatchItem, find_items
 from torchface.workflows.batch.batch_job import picture_path

@@ -11,8 +11,7 @@ from torchface.errors import AlignmentError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import Similarity
 from torchface.synthetic import performer
-from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
-from torchface.synthetic.stages.weight_curves import perform
+from torchface.synthetic.stages import StageFlaws, perform, place_markers, record
 from torchface.workflows.solve.solution import Solution, SolveSettings, solve_markers
 
 Capture = tuple[BlendshapeRig, Attachment, list[Tensor]]

@@ -10,11 +10,10 @@ import torch
 from planted.light_stage import LightStageSettings, render_lit_video
 from torchface import BlendshapeRig, save_rig
 from torchface.geometry.cameras.calibration import CameraCalibration
-from torchface.io.camera_files import save_calibration
-from torchface.landmarks import FaceReading
-from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
+from torchface.io import save_calibration
+from torchface.landmarks import FaceReading, LandmarkTracker
 from torchface.rendering.point_light import PointLight
-from torchface.synthetic.head.performer import performer
+from torchface.synthetic import performer
 from torchface.workflows.track import frame_readings
 from torchface.workflows.track.track_inputs import TrackSettings
 from torchface.workflows.track.track_result import Tracked

@@ -12,8 +12,7 @@ from tests.workflows.track.conftest import FRAMES, PIECE, QUICK, Done, Filmed
 from torchface.errors import ValueRangeError
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.video import open_video
-from torchface.landmarks import FaceReading
-from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
+from torchface.landmarks import FaceReading, LandmarkTracker
 from torchface.workflows.named_finders import graph_detector, load_finder
 from torchface.workflows.track import frame_readings
 from torchface.workflows.track.track_inputs import TrackSettings

@@ -9,15 +9,14 @@ from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import MarkerSolver, align_take, fit_attachment, rest_residual
+from torchface.capture.markers import HelmetMotion, sites_by_shape
 from torchface.capture.markers.attachment.best_sites import PathMoments, best_sites
-from torchface.capture.markers.attachment.initial_sites import sites_by_shape
-from torchface.capture.markers.helmet_motion import HelmetMotion
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
 from torchface.errors import AlignmentError, NameMismatchError, TopologyError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix, rotation_vector
 from torchface.geometry.similarity import Similarity
 from torchface.synthetic import performer
-from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
+from torchface.synthetic.stages import StageFlaws, place_markers, record
 
 Performance = tuple[BlendshapeRig, Attachment, list[Tensor]]
 

@@ -8,15 +8,12 @@ from torch import Tensor
 
 from torchface.errors import ShapeError
 from torchface.geometry.cameras.pinhole import look_at
-from torchface.io.images.image_files import load_image
+from torchface.io import load_image
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
 from torchface.io.video import open_video
-from torchface.landmarks.images.boxes.face_box import (
-    FaceBoxes,
-    NoFaceError,
-    overlaps,
-)
-from torchface.landmarks.images.find_faces import find_faces, find_some_faces
+from torchface.landmarks import FaceBoxes, NoFaceError, find_faces
+from torchface.landmarks.images.boxes.face_box import overlaps
+from torchface.landmarks.images.find_faces import find_some_faces
 from torchface.landmarks.images.ibug_68 import box_around
 from torchface.rendering.clay_shading import render
 from torchface.synthetic import performer

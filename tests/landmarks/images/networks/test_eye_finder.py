@@ -6,11 +6,10 @@ import pytest
 import torch
 from real_faces import by_hand, errors
 
-from torchface.landmarks import FaceReading
+from torchface.landmarks import EyeFindings, FaceReading
 from torchface.landmarks.images.landmark_finder import find_in_box
 from torchface.landmarks.images.networks.eye_crop import EYE_LANDMARKS, eye_transforms
 from torchface.landmarks.images.networks.eye_finder import EyedFinder, EyeFinder, merged_lids
-from torchface.landmarks.images.networks.eye_network import EyeFindings
 from torchface.workflows.named_finders import load_finder
 from train.rendered_people.head_kind import performer_kind
 

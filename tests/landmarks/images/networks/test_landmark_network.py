@@ -9,8 +9,7 @@ from torch.utils.data import TensorDataset
 
 from torchface import zoo
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.io.images.image_files import load_image
-from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.io import load_image, load_landmark_points
 from torchface.landmarks import LandmarkNetwork, NetworkSettings
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
 from torchface.landmarks.images.ibug_68 import INNER, MIRROR_68, box_around

@@ -12,22 +12,21 @@ from torchface import zoo
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.rotations import rotation_matrix
-from torchface.io.images.image_files import load_image
-from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.io import load_image, load_landmark_points
 from torchface.io.video import open_video, write_video
 from torchface.landmarks import (
     AppearanceModel,
+    FaceReading,
     LandmarkTracker,
     LandmarkTrees,
     NoFaceError,
+    TreeFinder,
     find_landmarks,
     landmark_jitter,
     track_landmarks,
 )
-from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.ibug_68 import MIRROR_68, box_around, turned_box
 from torchface.landmarks.images.trees.landmark_consensus import ConsensusSettings, consensus
-from torchface.landmarks.images.trees.tree_finder import TreeFinder
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import performer
 

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.io.images.image_files import load_image
+from torchface.io import load_image, load_landmark_points
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
-from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.landmarks import LandmarkTrees, TreeSettings
 from torchface.landmarks.images.ibug_68 import MIRROR_68, box_around, relative_errors
 from torchface.landmarks.images.trees.landmark_trees import FAINTEST, initial_shapes, similarity_to
