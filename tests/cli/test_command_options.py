@@ -220,6 +220,7 @@ def test_an_option_given_in_the_way_of_another_is_refused_with_the_right_way(
         ("solve r.glb --take a.c3d b.c3d --out o.csv", "r.glb a.c3d b.c3d --out o.csv"),
         ("solve r.glb a.c3d --out o.csv", "r.glb a.c3d --out o.csv"),
         ("convert a.obj --out", "a.obj --out"),
+        ("track --video l.mp4 --video r.mp4 --out o.csv", "--video l.mp4 --video r.mp4 --out o.csv"),
     ],
 )
 def test_what_has_a_place_may_be_given_as_a_flag(words: str, right: str) -> None:

@@ -175,7 +175,9 @@ def plain_options(command: Command) -> Command:
 def placed(command: Callable[..., Any], words: Sequence[str]) -> list[str]:
     """The words, in which what has a place and was given as a flag, such as ``--out`` of convert, stands there."""
     words, hints = list(words), get_type_hints(command, include_extras=True)
-    marked = {name: hint for name, hint in hints.items() if Positional in getattr(hint, "__metadata__", ())}
+    notes = {name: getattr(hint, "__metadata__", ()) for name, hint in hints.items()}
+    own = {getattr(note, "name", None) for row in notes.values() for note in row}  # options that are called as a place
+    marked = {name: hint for name, hint in hints.items() if Positional in notes[name] and name not in own}
     for place, (name, hint) in enumerate(marked.items()):
         flags = (f"--{name.replace('_', '-')}", *(["-o"] if name == "out" else []))
         at = next((i for i, word in enumerate(words) if word.partition("=")[0] in flags), len(words))

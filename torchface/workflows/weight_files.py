@@ -123,8 +123,8 @@ def check_live_link(names: Sequence[str], target: Path | str | None) -> None:
         )
 
 
-def _with_eyes(take: Take, rig: BlendshapeRig) -> Take:
-    """With the rotations of the eyes that its weights say, unless it comes with columns of its own."""
+def with_eyes(take: Take, rig: BlendshapeRig) -> Take:
+    """A take with the rotations of the eyes that its weights say, unless it comes with columns of its own."""
     if "columns" in take.extras:
         return take
     assert take.weights is not None
@@ -156,10 +156,10 @@ def write_weights(
         if lost:
             save_weights_csv(few, files.out)
         else:
-            save_live_link(_with_eyes(few, rig), files.out)
+            save_live_link(with_eyes(few, rig), files.out)
         if files.live_link is not None:
             make_folder(files.live_link.parent)
-            save_live_link(_with_eyes(few, rig), files.live_link)
+            save_live_link(with_eyes(few, rig), files.live_link)
     if lost and files.live_link is not None:
         more = f" and {len(lost) - _SHOWN} more" if len(lost) > _SHOWN else ""
         listed = ", ".join(lost[:_SHOWN]) + more

@@ -36,12 +36,14 @@ def test_frames_arrive_in_their_order_and_time(receiver: socket.socket) -> None:
     def wait(seconds: float) -> None:
         now[0] += seconds
 
-    report = stream_weights(weights, ARKIT, 60.0, address(receiver), lambda: now[0], wait)
+    turns = torch.rand(20, 9, generator=torch.Generator().manual_seed(1))
+    report = stream_weights(weights, ARKIT, 60.0, address(receiver), lambda: now[0], wait, rotations=turns)
     frames = [decode_frame(receiver.recv(2048)) for _ in range(20)]
     assert [frame.frame for frame in frames] == list(range(20))
     assert now[0] == pytest.approx(100 + 20 / 60)
     assert torch.equal(report.weights, weights)
-    assert torch.equal(torch.stack([torch.as_tensor(frame.weights)[: len(ARKIT)] for frame in frames]), weights)
+    assert torch.equal(torch.stack([frame.weights for frame in frames]), weights)
+    assert torch.equal(torch.stack([frame.rotations for frame in frames]), turns)
 
 
 def test_frames_at_uneven_times_go_out_at_these(receiver: socket.socket) -> None:

@@ -36,8 +36,12 @@ def stream_weights(
     clock: Callable[[], float] = time.perf_counter,
     wait: Callable[[float], None] = time.sleep,
     times: Sequence[float] | None = None,
+    rotations: Tensor | None = None,
 ) -> StreamReport:
-    """Sends frames of weights (N,), taken when they are due, at ``fps`` or at times in seconds after the first."""
+    """Sends frames of weights (N,), taken when they are due, at ``fps`` or at times in seconds after the first.
+
+    ``rotations`` (T,9) are Live Link Face's of head and eyes, radians; none turn if absent.
+    """
     sent: list[Tensor] = []
     latency: list[float] = []
     coming = iter(frames)
@@ -53,7 +57,7 @@ def stream_weights(
             weights = next(coming, None)
             if weights is None:
                 break
-            sender.send(weights)
+            sender.send(weights, None if rotations is None else rotations[row])
             latency.append(1000 * (clock() - came))
             sent.append(weights)
     if not sent:
