@@ -9,13 +9,14 @@ import torch
 
 from planted.characters import Planted, write_character
 from planted.glb_files import packed, unpacked
-from torchface import Take, Track, save_take
+from torchface import Attachment, Take, Track, save_take
 from torchface.errors import FileFormatError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io import save_calibration, save_mesh, save_pts, save_rig
-from torchface.mesh import Mesh
+from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig
-from torchface.synthetic import neutral_head
+from torchface.synthetic import neutral_head, performer
+from torchface.workflows.convert_file import convert_file
 from torchface.workflows.describe_file import describe
 
 
@@ -124,6 +125,34 @@ def test_triangles_without_area_are_counted_where_a_rig_is_described(tmp_path: P
     assert dict(describe(tmp_path / "rig.glb"))["triangles without area"] == "1 at rest, 1 in folded"
     save_rig(BlendshapeRig(Mesh(vertices[:4], faces[:2]), rig.deltas[1:, :4], ["half"]), tmp_path / "whole.glb")
     assert "triangles without area" not in dict(describe(tmp_path / "whole.glb"))
+
+
+def test_heads_beside_each_other_are_listed_and_one_head_is_not(tmp_path: Path) -> None:
+    rig = performer(texture=False)
+    count, apart = len(rig.vertices), torch.tensor([400.0, 0.0, 0.0])
+    faces = torch.cat([rig.neutral.faces, rig.neutral.faces + count])
+    both = {"Anna": torch.arange(2 * count) < count, "Bert": torch.arange(2 * count) >= count}
+    mesh = Mesh(torch.cat([rig.vertices, rig.vertices + apart]), faces, annotations=Annotations(regions=both))
+    deltas = torch.cat([rig.deltas, rig.deltas], 1)
+    deltas[20:, count:] = 0
+    save_rig(BlendshapeRig(mesh, deltas, rig.names), tmp_path / "two.glb")
+    said = dict(describe(tmp_path / "two.glb"))["heads"]
+    assert said.startswith(f"2: Anna ({len(rig.names)} shapes), Bert (20 shapes); they are one rig here")
+    assert any(said in note for note in convert_file(tmp_path / "two.glb", tmp_path / "both.glb").notes)
+    assert not convert_file(tmp_path / "two.glb", tmp_path / "anna.glb", part="Anna").notes
+    assert "heads" not in dict(describe(tmp_path / "two.glb", part="Bert"))
+    save_rig(rig, tmp_path / "one.glb")
+    assert "heads" not in dict(describe(tmp_path / "one.glb"))
+
+
+def test_markers_see_no_shape_without_motion_and_it_is_not_spoken_of(tmp_path: Path) -> None:
+    rig = performer(texture=False).select(["jawOpen"])
+    rig = BlendshapeRig(rig.neutral, torch.cat([0 * rig.deltas, rig.deltas]), ("Basis", "jawOpen"))
+    save_rig(rig, tmp_path / "rig.glb")
+    Attachment.from_vertices(rig.neutral, rig.neutral.landmarks).save(tmp_path / "sites.json")
+    said = dict(describe(tmp_path / "rig.glb", tmp_path / "sites.json"))["what the markers see"]
+    assert "1 of the 1 shapes clearly" in said
+    assert "Basis" not in said
 
 
 def test_a_home_of_nobody_is_no_file() -> None:

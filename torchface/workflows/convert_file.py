@@ -28,7 +28,7 @@ from torchface.mesh import Mesh, submesh
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
-from torchface.workflows.posed_mesh import load_neutral, posed_mesh
+from torchface.workflows.posed_mesh import load_neutral, posed_mesh, several_heads
 from torchface.workflows.rig_names import Naming, naming_lines, renamed, renamed_detail
 from torchface.workflows.weight_files import checked_reduction
 
@@ -99,6 +99,8 @@ def convert_file(
     if isinstance(detail, DetailMaps):
         detail = renamed_detail(detail, source_rig.rig, names)
     notes += write_source(rig, source_rig.take, detail, out, reduce)
+    if part is None and (heads := several_heads(source_rig.rig)):
+        notes.append(f"heads: {heads}")
     return Converted(rig.neutral, rig, source_rig.take, (*naming_lines(source_rig.rig, names), *notes))
 
 

@@ -42,7 +42,7 @@ from torchface.rig import BlendshapeRig
 from torchface.shape_names.recognised_names import arkit_count, recognised_shapes
 from torchface.take import Take
 from torchface.workflows.named_finders import BUNDLE
-from torchface.workflows.posed_mesh import load_neutral, size_faults
+from torchface.workflows.posed_mesh import load_neutral, several_heads, size_faults
 from torchface.workflows.weight_files import weight_faults
 
 if TYPE_CHECKING:  # solvers and onnx take seconds to load; few files need them
@@ -79,12 +79,15 @@ def describe(path: Path, attachment: Path | None = None, part: str | None = None
             return _with_texture_rows(path, _mesh_rows(mesh))
         rig = rig or load_rig(path, part=part)  # whose error says what is missing
         rows = [*_with_texture_rows(path, _rig_rows(rig)), *_animation_rows(path)]
+        if part is None and (heads := several_heads(rig)):
+            rows.append(("heads", heads))
         if attachment is not None:
             from torchface.capture.markers import MarkerSolver, observability
 
             where = Attachment.load(attachment)
             where.check(rig.neutral, attachment, path)
-            visible = observability(MarkerSolver(rig, where))
+            moving = [name for name, delta in zip(rig.names, rig.deltas, strict=True) if bool(delta.any())]
+            visible = observability(MarkerSolver(rig if rig.correctives else rig.select(moving), where))
             rows += [("what the markers see", str(visible))]
         return rows
     if attachment is not None:

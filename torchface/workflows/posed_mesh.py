@@ -16,6 +16,9 @@ from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping, near_names
 from torchface.workflows.weight_files import load_weight_take
 
+_FEW, _ALIKE = 5, 0.5
+"""Shapes that move a head; of the largest head's size, what another has at least."""
+
 _HEADS, _BODY, _TALLEST = (80, 700), 0.45, 2500.0
 """Millimetres: the largest extent of a face or head; a body's least width of its height, and its height."""
 
@@ -92,6 +95,32 @@ def load_neutral(path: Path, unit: str | None = None, part: str | None = None) -
             pass
     mesh = load_mesh(path, unit)
     return mesh if part is None else submesh(mesh, region(mesh, part)).mesh, None
+
+
+def several_heads(rig: BlendshapeRig) -> str:
+    """Which parts of a rig are heads beside each other, with the number of shapes that move each; empty of one."""
+    notes = rig.neutral.annotations
+    found: list[tuple[float, str, int, Tensor, Tensor]] = []
+    for name, rows in ({} if notes is None else notes.regions).items():
+        moving = int((rig.deltas[:, rows] != 0).any(2).any(1).sum())
+        if moving >= _FEW:
+            points = rig.vertices[rows].detach()
+            low, high = points.amin(0), points.amax(0)
+            found.append((float((high - low).max()), name, moving, low, high))
+    heads: list[tuple[float, str, int, Tensor, Tensor]] = []
+    for one in sorted(found, key=lambda one: -one[0]):
+        size, _, _, low, high = one
+        # Whatever lies above or below, such as a neck, is of the same person.
+        apart = all(bool(((low > other[4]) | (high < other[3]))[[0, 2]].any()) for other in heads)
+        if apart and (not heads or size >= _ALIKE * heads[0][0]):
+            heads.append(one)
+    if len(heads) < 2:
+        return ""
+    listed = ", ".join(f"{name} ({moving} shapes)" for _, name, moving, *_ in heads)
+    return (
+        f"{len(heads)}: {listed}; they are one rig here, a shape that both have moves both; --part {heads[0][1]} keeps "
+        "one"
+    )
 
 
 def size_faults(mesh: Mesh) -> list[str]:
