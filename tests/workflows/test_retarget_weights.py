@@ -85,6 +85,21 @@ def test_a_shape_without_motion_does_not_count_as_driven(tmp_path: Path, capsys:
     assert "1 of 3 shapes driven nothing drives mouthPucker has no motion in the target: mouthSmileLeft" in said
 
 
+def test_an_identity_shape_is_not_spoken_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    rig = performer(texture=False).select(["jawOpen"])
+    names, deltas = ("Basis", "jawOpen", "thin"), torch.cat([0 * rig.deltas, rig.deltas, 0 * rig.deltas])
+    save_rig(BlendshapeRig(rig.neutral, deltas, names), tmp_path / "rig.glb")
+    for known in (("jawOpen",), ("Basis", "jawOpen")):
+        weights = torch.tensor([float(name == "jawOpen") for name in known]).expand(2, -1)
+        save_take(Take(30.0, weights=Track(known, weights[..., None])), tmp_path / "take.csv")
+        words = ["retarget", tmp_path / "take.csv", "--to", tmp_path / "rig.glb", "--out", tmp_path / "out.csv"]
+        main([str(word) for word in words])
+        said = " ".join(capsys.readouterr().err.split())
+        assert "1 of 1 shapes driven" in said
+        assert "Basis" not in said
+        assert "thin" not in said
+
+
 def test_names_that_nothing_knows_are_refused_with_the_flags_that_map_them(tmp_path: Path) -> None:
     save_rig(performer(texture=False).select(["jawOpen"]), tmp_path / "rig.glb")
     save_take(Take(30.0, weights=Track(("にやり", "ぺろっ"), torch.ones(2, 2, 1))), tmp_path / "mmd.csv")

@@ -56,10 +56,10 @@ def retarget(
     files = WeightFiles(out, animation, live_link, reduce)
     with file_lock(out, ".csv"), progress_bars(quiet) as progress:
         done = retarget_weights(weights, to, files, from_, table, part, progress, poses)
-    driven = len(done.shapes.to_names) - len(done.shapes.undriven) - len(done.still)
-    console.print(f"{len(done.take)} frames; {driven} of {len(done.shapes.to_names)} shapes driven")
+    count = len(done.driven) + len(done.undriven) + len(done.still)
+    console.print(f"{len(done.take)} frames; {len(done.driven)} of {count} shapes driven")
     for what, names in (
-        ("nothing drives", done.shapes.undriven),
+        ("nothing drives", done.undriven),
         ("drives nothing:", done.shapes.unused),
         ("has no motion in the target:", done.still),
     ):

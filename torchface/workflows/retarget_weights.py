@@ -43,7 +43,9 @@ class Retargeted:
     shapes: ShapeMap
     warnings: tuple[str, ...]  # what a file leaves out, what examples do not determine
     notes: tuple[str, ...] = ()  # what was learned of examples, and how many keys files have
-    still: tuple[str, ...] = ()  # shapes of the target that are driven and have no motion
+    driven: tuple[str, ...] = ()  # shapes of the target that move, and something drives them
+    undriven: tuple[str, ...] = ()  # that move, and nothing drives them
+    still: tuple[str, ...] = ()  # that have weights in a frame and no motion
 
 
 def retarget_weights(
@@ -95,9 +97,14 @@ def retarget_weights(
     moved.weights.values[faceless] = torch.nan  # of shapes that nothing drives as well
     progress("writing")
     left_out, written = write_weights(moved, files, target, to if part is None else None)
-    unmoved = (~target.deltas.flatten(1).any(1)).nonzero()[:, 0].tolist()
-    still = [target.names[row] for row in unmoved if target.names[row] not in shapes.undriven]
-    return Retargeted(moved, shapes, (*faults, *notes, *left_out), (*said, *written), tuple(still))
+    moves, weighed = target.deltas.flatten(1).any(1), (moved.weights.values.nan_to_num() != 0).flatten(2).any(2).any(0)
+    undriven = torch.tensor([name in shapes.undriven for name in target.names])
+    # An identity shape such as Blender's Basis is nobody's loss.
+    driven, open_ones, still = (
+        tuple(name for name, is_one in zip(target.names, rows.tolist(), strict=True) if is_one)
+        for rows in (moves & ~undriven, moves & undriven, ~moves & weighed)
+    )
+    return Retargeted(moved, shapes, (*faults, *notes, *left_out), (*said, *written), driven, open_ones, still)
 
 
 def _unmatched(weights: Track, shapes: ShapeMap, source: Path, target: Path) -> list[str]:

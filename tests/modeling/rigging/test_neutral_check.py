@@ -117,6 +117,16 @@ def test_shapes_that_make_another_person_are_no_expressions(actor: BlendshapeRig
         assert "--pose jawOpen=0." in note
 
 
+def test_a_wider_head_is_no_expression_of_a_template_without_arkits_names(actor: BlendshapeRig) -> None:
+    fat = (actor.vertices - actor.vertices.mean(0)) * torch.tensor([0.15, 0.0, 0.1])
+    smile = actor.deltas[[actor.names.index("mouthSmileLeft")]] + actor.deltas[[actor.names.index("mouthSmileRight")]]
+    template = BlendshapeRig(actor.neutral, torch.cat([0 * smile, fat[None], smile]), ("Basis", "plump", "happy"))
+    assert neutral_notes(template, actor.neutral.with_vertices(actor.vertices + fat)) == ()
+    (note,) = neutral_notes(template, actor.neutral.with_vertices(actor.vertices + fat + smile[0]))
+    assert "happy=" in note
+    assert "plump" not in note
+
+
 def test_a_template_without_shapes_shows_no_expression(actor: BlendshapeRig, people: list[Mesh]) -> None:
     assert neutral_notes(actor.select([]), people[0]) == ()
 

@@ -22,6 +22,9 @@ _OWN_HEAD = 0.01  # of the squared difference is left where the head is the temp
 _SQUEEZED, _AFFINE_SHARE = 1.3, 0.7  # of heads at rest 1.21 and 0.67 at most
 _TURNED = 30.0  # degrees; heads at rest 11 at most
 _SHORTEST = 1e-3  # of the template's extent: shorter edges count as so long
+# Of the vertices: a shape that moves more of them by a tenth of its way is another head, such as a wider one, and no
+# expression. Those of three rigs move 47 % of a face at most, a wider or thinner head 86 %.
+_WHOLE = 0.65
 _NAMED = 4
 
 
@@ -123,6 +126,8 @@ def _expression_notes(template: BlendshapeRig, rest: Tensor, goal: Tensor) -> li
     signal = found.square() * (energy * where).sum(1)
     share = signal / (signal + where @ fit.left(found)).clamp(min=1e-12)
     there = (found > _WEIGHT) & (share > _SHARE) & (found * way > _WAY)
+    motion = template.deltas.detach().cpu().norm(dim=-1)
+    there &= (motion > 0.1 * motion.amax(1, keepdim=True)).double().mean(1) < _WHOLE
     expressions = recognised_mapping(template.names, ARKIT).any(0)
     if bool(expressions.any()):
         there &= expressions
