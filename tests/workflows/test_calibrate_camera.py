@@ -15,11 +15,11 @@ from torchface.geometry.rotations import rotation_matrix, rotation_vector
 from torchface.io import load_calibration, load_cameras, load_image, save_image
 from torchface.io.video import write_video
 from torchface.progress import silent
+from torchface.workflows.calibrate_beside import calibrate_beside
 from torchface.workflows.calibrate_camera import (
     Board,
     View,
     calibrate,
-    calibrate_beside,
     calibrate_views,
     find_boards,
     find_corners,
@@ -162,6 +162,9 @@ def test_two_cameras_are_put_where_they_are(
     torch.testing.assert_close(-right.rotation.T @ right.translation, stand, atol=1.0, rtol=0)
     with pytest.raises(AlignmentError, match="the board in 2 views"):
         calibrate_beside([Path(films[0]), write_video(iter(seen[:2]), tmp_path / "short.avi", 10.0).path], BOARD, out)
+    late = write_video(iter([*seen[3:], *seen[:3]]), tmp_path / "late.avi", 10.0).path
+    with pytest.raises(AlignmentError, match=r"no place of late\.avi beside left\.avi"):
+        calibrate_beside([Path(films[0]), late], BOARD, out)
 
 
 def test_useless_pictures_are_refused(pictures: list[Tensor]) -> None:

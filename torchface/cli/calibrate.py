@@ -34,7 +34,8 @@ def calibrate(
             by timecode or begun together: OUT then says where all cameras lie, for `torchface track --cameras`.
     """
     from torchface.files.job_lock import file_lock
-    from torchface.workflows.calibrate_camera import Board, calibrate_beside
+    from torchface.workflows.calibrate_beside import calibrate_beside
+    from torchface.workflows.calibrate_camera import Board
     from torchface.workflows.calibrate_camera import calibrate as run
 
     match = re.fullmatch(r"(\d{1,3})[xX](\d{1,3})", corners.strip())

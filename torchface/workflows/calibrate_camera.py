@@ -1,4 +1,4 @@
-"""From images of a checkerboard to the calibration of a camera, or of several that are fixed to each other, on disk."""
+"""From images of a checkerboard to the calibration of a camera on disk."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -14,16 +14,15 @@ from torchface.color_space import grey_images
 from torchface.errors import AlignmentError, FileFormatError, ShapeError, ValueRangeError
 from torchface.files.files_beside import check_beside, write_beside
 from torchface.files.whole_files import check_ending, check_writable, make_folder
-from torchface.geometry.cameras.calibration import CameraCalibration, PlacedCamera
-from torchface.io.camera_files import save_calibration, save_cameras
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.io.camera_files import save_calibration
 from torchface.io.images.image_files import encode_png, load_image
 from torchface.io.video import open_video
-from torchface.io.video.timecodes import start_of
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import caption, sheet
 
 _VIDEOS = (".avi", ".mkv", ".webm", ".mp4", ".mov")
-_MIN_VIEWS, _MAX_FRAMES = 5, 60
+MIN_VIEWS, _MAX_FRAMES = 5, 60
 _DETECTED_AT = 1920  # pixels of the longer side; larger images are searched reduced and refined at full size
 _MIN_MOVEMENT = 0.01  # of the width: views whose corners move less say nothing new
 _MIN_TILT = 10.0  # degrees between the boards of some two views
@@ -107,7 +106,7 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
     check_beside(out, overlay_path)
     if not paths:
         raise FileFormatError("calibrate: found no image, expected some of a checkerboard, or a video")
-    views, left_out = find_boards(_images(paths), board, progress)
+    views, left_out = find_boards(board_images(paths), board, progress)
     progress(f"calibrating from {len(views)} views")
     report = calibrate_views(views, board, left_out)
     progress("writing the calibration and the overlay")
@@ -116,59 +115,6 @@ def calibrate(paths: Sequence[Path], board: Board, out: Path, progress: Progress
     write_beside(out, {overlay_path.name: encode_png(corners)})
     save_calibration(report.calibration, out)
     return replace(report, overlay_path=overlay_path)
-
-
-def calibrate_beside(
-    films: Sequence[Path], board: Board, out: Path, progress: Progress | None = None
-) -> tuple[list[CalibrationReport], list[PlacedCamera], list[str]]:
-    """Calibrates cameras that are fixed to each other, from their films of one checkerboard, and writes them.
-
-    Returns:
-        A report of each camera, the cameras, and lines about how they lie.
-    """
-    progress = progress or silent
-    check_ending(out, ".toml")
-    check_writable(out)
-    reports, views = [], []
-    for film in films:
-        found, left_out = find_boards(_images([film]), board, progress)
-        reports.append(calibrate_views(found, board, left_out))
-        views.append({int(view.name.split()[-1]): view for view in found if view.name in reports[-1].used})
-    rates, starts = [open_video(film).fps for film in films], [start_of(film) for film in films]
-    nowhere = torch.eye(3, dtype=torch.float64), torch.zeros(3, dtype=torch.float64)
-    cameras = [PlacedCamera(reports[0].calibration, *nowhere, films[0].stem)]
-    lines = []
-    for film, report, rate, start in zip(films[1:], reports[1:], rates[1:], starts[1:], strict=True):
-        progress(f"looking for the board in {film.name} and {films[0].name} at once")
-        begin = 0.0 if start is None or starts[0] is None else start - starts[0]
-        wanted = {round((number / rates[0] - begin) * rate): view for number, view in views[0].items()}
-        pairs = []
-        for number, frame in enumerate(open_video(film).frames()):
-            if number in wanted and (corners := find_corners(frame, board)) is not None:
-                first = wanted[number].corners
-                # Some boards look the same after half a turn.
-                alike = ((first[-1] - first[0]) * (corners[-1] - corners[0])).sum() > 0
-                pairs.append((first, corners if alike else corners.flip(0)))
-        if len(pairs) < _MIN_VIEWS:
-            raise AlignmentError(
-                f"calibrate: found the board in {films[0].name} and {film.name} at once at {len(pairs)} moments, "
-                f"expected {_MIN_VIEWS} at least: hold it where both cameras see all of it"
-            )
-        one, other = reports[0].calibration, report.calibration
-        first_seen, then_seen = ([pair[k].numpy().reshape(-1, 1, 2) for pair in pairs] for k in (0, 1))
-        (K1, d1), (K2, d2) = ((x.intrinsics.numpy(), x.distortion.numpy()) for x in (one, other))
-        points, size = [board.points.numpy()] * len(pairs), (one.width, one.height)
-        held = cv2.CALIB_FIX_INTRINSIC
-        error, *_, R, t, _, _ = cv2.stereoCalibrate(points, first_seen, then_seen, K1, d1, K2, d2, size, flags=held)
-        place = torch.from_numpy(np.asarray(R)), torch.from_numpy(np.asarray(t).ravel())
-        cameras.append(PlacedCamera(other, *place, film.stem))
-        lines.append(
-            f"{film.stem}: {float((place[0].T @ place[1]).norm()):.1f} mm from {films[0].stem}, "
-            f"from {len(pairs)} moments, {error:.3f} pixels off root mean square"
-        )
-    make_folder(out.parent)
-    save_cameras(cameras, out)
-    return reports, cameras, lines
 
 
 def find_boards(
@@ -310,16 +256,17 @@ def _fit(views: Sequence[View], board: Board) -> _Fit:
 
 
 def _check_count(views: Sequence[View], left_out: Sequence[tuple[str, str]]) -> None:
-    if len(views) >= _MIN_VIEWS:
+    if len(views) >= MIN_VIEWS:
         return
     why = "; ".join(f"{name}: {reason}" for name, reason in left_out[:8])
     raise AlignmentError(
-        f"calibrate: found the board in {len(views)} views, expected {_MIN_VIEWS} at least that differ"
+        f"calibrate: found the board in {len(views)} views, expected {MIN_VIEWS} at least that differ"
         + (f" ({why})" if why else "")
     )
 
 
-def _images(paths: Sequence[Path]) -> Iterator[tuple[str, Tensor]]:
+def board_images(paths: Sequence[Path]) -> Iterator[tuple[str, Tensor]]:
+    """Names and grey images uint8 (H,W) of files, or of a video's frames."""
     videos = [path for path in paths if path.suffix.lower() in _VIDEOS]
     if videos and len(paths) > 1:
         raise FileFormatError(f"{videos[0]}: found a video beside {len(paths) - 1} files, expected it alone, or images")
