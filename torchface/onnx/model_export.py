@@ -5,12 +5,9 @@ from pathlib import Path
 
 from torch import nn
 
-from torchface.capture import ActionUnitClassifier, ExampleSolver, MarkerSolver
-from torchface.capture.own_rig import VideoSolver
-from torchface.capture.priors import DynamicsPrior, ShapePrior
+from torchface.capture import ActionUnitClassifier, DynamicsPrior, ExampleSolver, MarkerSolver, ShapePrior, VideoSolver
 from torchface.errors import ValueRangeError
-from torchface.landmarks import BoxNetwork, LandmarkNetwork, LandmarkTrees, UVLandmarkDetector
-from torchface.landmarks.images.networks.eye_network import EyeNetwork
+from torchface.landmarks import BoxNetwork, EyeNetwork, LandmarkNetwork, LandmarkTrees, UVLandmarkDetector
 from torchface.landmarks.images.networks.part_network import PartNetwork
 from torchface.modeling import ExpressionRegression, HeadModel
 from torchface.onnx.action_unit_graph import ActionUnitReport, export_action_units

@@ -8,10 +8,8 @@ import onnx
 import torch
 from torch import Tensor, nn
 
-from torchface.landmarks.images.boxes.box_network import BoxNetwork
+from torchface.landmarks import BoxNetwork, EyeFindings, EyeNetwork, LandmarkNetwork, NetworkLandmarks
 from torchface.landmarks.images.folded_normalisation import without_normalisation
-from torchface.landmarks.images.networks.eye_network import EyeFindings, EyeNetwork
-from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork, NetworkLandmarks
 from torchface.landmarks.images.networks.part_network import PART_MARGIN, PART_SIZE, PARTS, PartNetwork
 from torchface.onnx.checked_export import ExportReport, write_checked
 from torchface.onnx.exported_model import exported_model, half_stored

@@ -5,11 +5,10 @@ import copy
 import torch
 from torch import Tensor, nn
 
+from torchface.capture import MarkerSolver
 from torchface.capture.energy import Quadratic, pull_term
-from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.optim.fixed_splitting import FixedSplitting
-from torchface.optim.projected_gradient import ProjectedGradient
+from torchface.optim import FixedSplitting, ProjectedGradient
 
 Program = FixedSplitting | ProjectedGradient
 

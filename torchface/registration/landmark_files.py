@@ -6,8 +6,7 @@ import torch
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.documents import read_json
-from torchface.io.landmarks.landmark_points import load_landmark_points
-from torchface.io.landmarks.picks import load_correspondences
+from torchface.io import load_correspondences, load_landmark_points
 from torchface.io.length_units import millimetres_per
 from torchface.io.rig_files import GLTF_ENDINGS
 from torchface.io.usd.usd_writing import USD_ENDINGS

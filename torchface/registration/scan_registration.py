@@ -31,12 +31,7 @@ from torchface.registration.scan_colors import (
     with_edge_of_hair,
 )
 from torchface.registration.scan_completion import completed_colors, completed_form
-from torchface.registration.scan_preparation import (
-    Landmarks,
-    PreparedScan,
-    check_template,
-    prepare_scan,
-)
+from torchface.registration.scan_preparation import Landmarks, PreparedScan, check_template, prepare_scan
 from torchface.registration.scan_start import Detector, StartOnScan, scale_notes, start_on_scan
 
 _NEAR = 3.0

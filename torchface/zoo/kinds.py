@@ -4,23 +4,20 @@ import re
 
 from torch import nn
 
-from torchface.capture.action_units.classifier import ActionUnitClassifier
-from torchface.capture.anybody.examples.example_solver import ExampleSolver
-from torchface.capture.markers.marker_solver import MarkerSolver
-from torchface.capture.own_rig.video_solver import VideoSolver
-from torchface.capture.priors import DynamicsPrior, ReciprocalPrior, ShapePrior
-from torchface.enhancement.enhancement_model import EnhancementModel
+from torchface.capture import ActionUnitClassifier, DynamicsPrior, ExampleSolver, MarkerSolver, ShapePrior, VideoSolver
+from torchface.capture.priors import ReciprocalPrior
+from torchface.enhancement import EnhancementModel
 from torchface.errors import NameMismatchError
-from torchface.landmarks.images.appearance.appearance_model import AppearanceModel
-from torchface.landmarks.images.boxes.box_network import BoxNetwork
-from torchface.landmarks.images.networks.eye_network import EyeNetwork
-from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
+from torchface.landmarks import (
+    AppearanceModel,
+    BoxNetwork,
+    EyeNetwork,
+    LandmarkNetwork,
+    LandmarkTrees,
+    UVLandmarkDetector,
+)
 from torchface.landmarks.images.networks.part_network import PartNetwork
-from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
-from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
-from torchface.modeling.morphable.head_model import HeadModel
-from torchface.modeling.morphable.morphable_model import MorphableModel
-from torchface.modeling.rigging.expression_regression import ExpressionRegression
+from torchface.modeling import ExpressionRegression, HeadModel, MorphableModel
 from torchface.number_checks import checked_type
 
 KINDS: dict[str, type[nn.Module]] = {

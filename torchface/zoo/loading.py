@@ -8,19 +8,12 @@ from typing import Any, Literal, TypeVar, overload
 import torch
 from torch import nn
 
-from torchface.capture.action_units.classifier import ActionUnitClassifier
-from torchface.capture.markers.marker_solver import MarkerSolver
-from torchface.capture.priors import DynamicsPrior, ShapePrior
+from torchface.capture import ActionUnitClassifier, DynamicsPrior, MarkerSolver, ShapePrior
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.files.models import CARD, ModelRecord, read_card, read_model, read_record
-from torchface.landmarks.images.boxes.box_network import BoxNetwork
-from torchface.landmarks.images.networks.eye_network import EyeNetwork
-from torchface.landmarks.images.networks.landmark_network import LandmarkNetwork
+from torchface.landmarks import BoxNetwork, EyeNetwork, LandmarkNetwork, LandmarkTrees, UVLandmarkDetector
 from torchface.landmarks.images.networks.part_network import PartNetwork
-from torchface.landmarks.images.trees.landmark_trees import LandmarkTrees
-from torchface.landmarks.scans.uv_detector import UVLandmarkDetector
-from torchface.modeling.morphable.head_model import HeadModel
-from torchface.modeling.rigging.expression_regression import ExpressionRegression
+from torchface.modeling import ExpressionRegression, HeadModel
 from torchface.zoo.hub import fetch_description, hub_reference
 from torchface.zoo.kinds import KINDS
 from torchface.zoo.model_folders import find, is_path, named_folders

@@ -8,13 +8,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
-from torchface.geometry.meshes.operators import (
-    border_vertices,
-    corners,
-    triangle_normals,
-    vertex_areas,
-    vertex_normals,
-)
+from torchface.geometry.meshes.operators import border_vertices, corners, triangle_normals, vertex_areas, vertex_normals
 from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.geometry.meshes.surface_index import triangle_coordinates
 from torchface.mesh import Mesh

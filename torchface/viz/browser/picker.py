@@ -11,8 +11,7 @@ from torch import Tensor
 from torchface.errors import TorchfaceError, ValueRangeError
 from torchface.files.whole_files import all_or_none, made_folder
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.io import save_mesh, save_rig
-from torchface.io.landmarks.picks import save_correspondences, save_landmarks
+from torchface.io import save_correspondences, save_landmarks, save_mesh, save_rig
 from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig
 from torchface.viz.browser.browser_page import SCALE, BrowserPage, frame_camera, icon

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.capture.markers.mesh_solver import MeshSolution, MeshSolver
+from torchface.capture.markers import MeshSolution, MeshSolver
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.files.documents import read_json
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder, write_file
@@ -24,11 +24,7 @@ from torchface.take import Take, Track
 from torchface.viz.figures.character_views import SHOWN, character_sheet
 from torchface.workflows.animated_meshes import known_rate, rate_notes
 from torchface.workflows.arkit.arkit_rig import Source, is_annotated, load_source, make_arkit
-from torchface.workflows.arkit.head_parameters import (
-    HeadParameters,
-    parameters_of,
-    save_parameters,
-)
+from torchface.workflows.arkit.head_parameters import HeadParameters, parameters_of, save_parameters
 from torchface.workflows.arkit.moving_head import MAX_JSON, load_moving_head
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig.character_face import plain_surface

@@ -10,23 +10,18 @@ from torch import Tensor
 from torchface.errors import AlignmentError, FileFormatError, NoShapesError, ValueRangeError
 from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.similarity import Similarity, similarity_transform
-from torchface.io import load_mesh, load_rig
-from torchface.io.blender.blender_files import BLENDER_ENDINGS
-from torchface.io.head_models.head_model_file import HeadModelFile
-from torchface.io.head_models.head_model_files import HEAD_MODEL_ENDINGS, is_head_model_file, load_head_model_file
+from torchface.io import HeadModelFile, load_head_model_file, load_mesh, load_rig
+from torchface.io.blender import BLENDER_ENDINGS
+from torchface.io.head_models.head_model_files import HEAD_MODEL_ENDINGS, is_head_model_file
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.mesh import Mesh, submesh
-from torchface.modeling import HeadModel
-from torchface.modeling.morphable.published_models import head_model_of
+from torchface.modeling import CarriedShapes, HeadModel, head_model_of, shapes_on
 from torchface.modeling.rigging.annotated_heads import annotations_on, on_face
-from torchface.modeling.rigging.carried_shapes import CarriedShapes
 from torchface.modeling.rigging.eyelid_closure import BLINKS
 from torchface.modeling.rigging.mouth_parts import tongue_out
-from torchface.modeling.rigging.other_topology import shapes_on
 from torchface.progress import Progress, silent
-from torchface.registration import Registration, register
-from torchface.registration.landmark_files import load_scan_landmarks
+from torchface.registration import Registration, load_scan_landmarks, register
 from torchface.registration.scan_preparation import Landmarks
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, recognised_shapes

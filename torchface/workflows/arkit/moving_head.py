@@ -14,12 +14,7 @@ from torchface.io.usd.usd_reading import read_usd_points
 from torchface.io.usd.usd_writing import USD_ENDINGS
 from torchface.workflows.animated_meshes import load_animated
 from torchface.workflows.arkit.arkit_rig import Source
-from torchface.workflows.arkit.head_parameters import (
-    HeadParameters,
-    has_parameters,
-    read_parameters,
-    stated_rate,
-)
+from torchface.workflows.arkit.head_parameters import HeadParameters, has_parameters, read_parameters, stated_rate
 
 MAX_JSON = 2**30
 """Bytes of a file of anchors or weights."""

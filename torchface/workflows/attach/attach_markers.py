@@ -9,24 +9,23 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.capture import MarkerSolver, align_take, clean_take, fit_attachment
-from torchface.capture.markers import AttachmentFit, Cleanup, check_attachment, sites_by_shape
+from torchface.capture.markers import AttachmentFit, Cleanup, Defect, check_attachment, sites_by_shape
 from torchface.capture.markers.attachment.attachment_fit import marker_paths
 from torchface.capture.markers.attachment.initial_sites import crossed_sides
 from torchface.capture.markers.cleaning.label_swaps import find_swaps_by_shape, swapped_back
-from torchface.capture.markers.cleaning.take_cleaning import Defect
 from torchface.capture.markers.helmet_motion import steady_take
 from torchface.capture.markers.rest_pose import check_not_mirrored, inlier_markers
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder
-from torchface.io import load_rig
-from torchface.io.landmarks.picks import load_landmarks
+from torchface.io import load_landmarks, load_rig
 from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import PICTURE_ENDINGS, save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
-from torchface.viz.figures.marker_maps import errors_by_iteration, site_views
+from torchface.viz import site_views
+from torchface.viz.figures.marker_maps import errors_by_iteration
 from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.contact_sheet import small_picture
 from torchface.workflows.batch.outcomes import RESULT, Made, word_of

@@ -14,12 +14,7 @@ from torchface.io.tables.csv_table import TableReader
 from torchface.mesh import Mesh
 from torchface.progress import Progress
 from torchface.workflows.animated_meshes import AnimatedMesh, known_rate, load_animated, moved_mesh, rate_notes
-from torchface.workflows.enhance.coarse_animation import (
-    CoarseAnimation,
-    check_finite,
-    resampling_note,
-    same_topology,
-)
+from torchface.workflows.enhance.coarse_animation import CoarseAnimation, check_finite, resampling_note, same_topology
 from torchface.workflows.enhance.head_correspondence import (
     PLACE,
     HeadCorrespondence,

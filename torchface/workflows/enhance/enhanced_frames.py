@@ -15,8 +15,7 @@ from torchface.enhancement.animation_retiming import at_moments, retimed_moments
 from torchface.errors import FileFormatError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.whole_files import make_folder
-from torchface.io import MeshSequence
-from torchface.io.meshes.mesh_sequence import MeshSequenceWriter
+from torchface.io import MeshSequence, MeshSequenceWriter
 from torchface.progress import Progress
 from torchface.workflows.enhance.coarse_animation import CoarseAnimation
 

@@ -7,13 +7,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.evaluation import (
-    ShapeErrors,
-    region_figures,
-    rigidly_aligned,
-    shape_errors,
-    vertex_errors,
-)
+from torchface.evaluation import ShapeErrors, region_figures, rigidly_aligned, shape_errors, vertex_errors
 from torchface.files.job_lock import within_job
 from torchface.files.whole_files import all_or_none
 from torchface.mesh import Annotations, Mesh

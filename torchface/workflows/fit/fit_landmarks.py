@@ -10,10 +10,9 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.whole_files import read_file
-from torchface.io.images.image_files import load_image
+from torchface.io import load_image, load_landmark_points
 from torchface.io.images.image_headers import read_header
 from torchface.io.landmarks.dlib_xml import LabelledFace, load_dlib_faces
-from torchface.io.landmarks.landmark_points import load_landmark_points
 from torchface.io.landmarks.landmark_tables import load_landmark_table
 from torchface.landmarks import FaceReading, NoFaceError, find_faces, find_landmarks
 from torchface.landmarks.images.face_mesh_478 import landmarks_of_mesh

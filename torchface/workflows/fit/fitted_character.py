@@ -18,8 +18,7 @@ from torchface.modeling.photographs.image_texture import without_colors
 from torchface.modeling.photographs.skin_light import exposed
 from torchface.registration import hidden_parts, with_template_skin
 from torchface.rig import BlendshapeRig
-from torchface.synthetic.head.embedded_character import character
-from torchface.synthetic.head.skin_maps import Look
+from torchface.synthetic import Look, character
 from torchface.synthetic.head.skin_texture import IRIS_EDGE
 
 _SIZE = 1024

@@ -12,14 +12,12 @@ from torchface.errors import FileFormatError
 from torchface.files.whole_files import all_or_none
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.pinhole import Camera
-from torchface.io import save_calibration, save_rig
-from torchface.io.images.image_files import load_image
-from torchface.io.landmarks.landmark_points import save_pts
+from torchface.io import load_image, save_calibration, save_pts, save_rig
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.video.video_file import VIDEO_ENDINGS
+from torchface.landmarks import FaceReading
 from torchface.landmarks.images.face_crop import cut_crop
-from torchface.landmarks.images.face_reading import FaceReading
 from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
 from torchface.modeling.photographs.image_texture import without_colors
 from torchface.modeling.photographs.landmark_view import JAW

@@ -8,8 +8,7 @@ from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.io.video import open_video
-from torchface.landmarks.images.face_reading import FaceReading
-from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
+from torchface.landmarks import FaceReading, LandmarkTracker
 from torchface.landmarks.images.tracking.video_landmarks import naming_the_frame
 from torchface.modeling.photographs.frame_choice import choose_frames
 from torchface.progress import Progress

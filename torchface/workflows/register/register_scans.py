@@ -6,17 +6,16 @@ from pathlib import Path
 
 from torchface import zoo
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.io import load_mesh, load_rig
-from torchface.io.head_models.head_model_files import is_head_model_file, load_head_model_file
+from torchface.io import load_head_model_file, load_mesh, load_rig
+from torchface.io.head_models.head_model_files import is_head_model_file
 from torchface.io.length_units import millimetres_per
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import Mesh, submesh
-from torchface.modeling import HeadModel, MorphableModel
-from torchface.modeling.morphable.published_models import head_model_of
+from torchface.modeling import HeadModel, MorphableModel, head_model_of
 from torchface.progress import Progress
+from torchface.registration import DEFAULT_SCHEDULE, Schedule
 from torchface.registration.landmark_files import ENDINGS, landmark_file
 from torchface.registration.model_fit import HasShape, LinearShape, ShapeModel, shape_model
-from torchface.registration.nonrigid.schedule import DEFAULT_SCHEDULE, Schedule
 from torchface.registration.scan_preparation import check_template
 from torchface.workflows.batch.batch_items import SCAN_ENDINGS, ItemKind, find_items
 from torchface.workflows.batch.outcomes import Outcome

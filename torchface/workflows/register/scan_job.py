@@ -14,22 +14,19 @@ from torchface.files.content_keys import content_key
 from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_mesh, save_mesh
 from torchface.io.meshes.named_files import named_files
-from torchface.landmarks import UVLandmarkDetector
-from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks
+from torchface.landmarks import AutomaticLandmarks, UVLandmarkDetector
 from torchface.mesh import Annotations, Mesh
 from torchface.modeling.rigging.part_placement import with_placed_parts
-from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
+from torchface.registration import Registration, Schedule, in_place_of, load_scan_landmarks, register
+from torchface.registration.landmark_files import landmark_file
 from torchface.registration.model_fit import LinearShape
-from torchface.registration.nonrigid.schedule import Schedule
 from torchface.registration.own_topology import as_it_is
-from torchface.registration.registered_mesh import in_place_of
 from torchface.registration.scan_colors import has_colors, without_colors
-from torchface.registration.scan_registration import NO_COLORS, Registration, register
+from torchface.registration.scan_registration import NO_COLORS
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import sheet
 from torchface.rig import BlendshapeRig
-from torchface.viz.figures.error_maps import error_colors
-from torchface.viz.figures.face_views import frame_face
+from torchface.viz import error_colors, frame_face
 from torchface.viz.figures.landmark_dots import with_dots
 from torchface.viz.figures.registration_views import lines_on_clay
 from torchface.workflows.batch.batch_items import BatchItem

@@ -21,8 +21,7 @@ from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import load_mesh, load_rig, save_rig
 from torchface.io.maya.maya_writing import MAYA_ENDING
 from torchface.io.rig_files import check_rig_ending
-from torchface.landmarks import UVLandmarkDetector
-from torchface.landmarks.scans.landmark_pairs import AutomaticLandmarks
+from torchface.landmarks import AutomaticLandmarks, UVLandmarkDetector
 from torchface.mesh import Mesh
 from torchface.modeling import (
     ExampleRig,
@@ -30,6 +29,7 @@ from torchface.modeling import (
     HeadModel,
     MorphableModel,
     NormalMap,
+    RiggingSchedule,
     bake_normal_map,
     clear_parts,
     detail_maps,
@@ -41,19 +41,18 @@ from torchface.modeling import (
     rig_from_examples,
     transfer_with_report,
 )
-from torchface.modeling.rigging.example_rigging import RiggingSchedule
 from torchface.modeling.rigging.neutral_check import pose_notes
 from torchface.modeling.rigging.part_clearance import penetration
 from torchface.modeling.rigging.part_placement import with_mouth_behind_skin, with_placed_parts
 from torchface.progress import Progress, silent
-from torchface.registration import Registration, in_place_of, register
-from torchface.registration.landmark_files import landmark_file, load_scan_landmarks
+from torchface.registration import Registration, in_place_of, load_scan_landmarks, register
+from torchface.registration.landmark_files import landmark_file
 from torchface.registration.own_topology import as_it_is
 from torchface.registration.scan_colors import without_colors
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
-from torchface.viz.figures.registration_views import registration_sheet
+from torchface.viz import registration_sheet
 from torchface.workflows.register.register_scans import load_shape_model
 from torchface.workflows.rig.actor_report import ActorReport
 from torchface.workflows.rig.expression_scans import (

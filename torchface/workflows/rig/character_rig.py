@@ -23,10 +23,9 @@ from torchface.io.images.image_files import IMAGE_ENDINGS, encode_png
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.vrm.vrm_expressions import VRM_ENDING, add_expressions
 from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
+from torchface.modeling import CarriedShapes, shapes_on
 from torchface.modeling.rigging.annotated_heads import annotations_on, on_face
-from torchface.modeling.rigging.carried_shapes import CarriedShapes
 from torchface.modeling.rigging.mouth_parts import tongue_out
-from torchface.modeling.rigging.other_topology import shapes_on
 from torchface.progress import Progress, silent
 from torchface.registration import Registration, register
 from torchface.rendering.compositing import save_rendered_image, sheet

@@ -12,10 +12,9 @@ from torchface.files.whole_files import make_folder
 from torchface.rendering.clay_shading import DEFAULT_LIGHTING, render
 from torchface.rendering.compositing import caption, sheet
 from torchface.rig import BlendshapeRig
-from torchface.viz.figures.curves import error_curve, motion_curves, weight_curves
+from torchface.viz import error_curve, frame_face, marker_map, weight_curves
+from torchface.viz.figures.curves import motion_curves
 from torchface.viz.figures.error_maps import round_maximum
-from torchface.viz.figures.face_views import frame_face
-from torchface.viz.figures.marker_maps import marker_map
 from torchface.viz.figures.region_colors import as_seen
 from torchface.viz.reports.player import Markers, Panel, Played, Player, write_player
 from torchface.viz.reports.report_page import Section, Table, write_page

@@ -11,13 +11,10 @@ from torchface.errors import ValueRangeError
 from torchface.io.landmarks.landmark_tables import load_landmark_table
 from torchface.io.video import VideoFile
 from torchface.io.video.blank_video import BlankVideo
+from torchface.landmarks import FaceReading, LandmarkFinder, LandmarkTracker, find_faces
 from torchface.landmarks.images.boxes.face_box import overlaps
 from torchface.landmarks.images.face_mesh_478 import landmarks_of_mesh
-from torchface.landmarks.images.face_reading import FaceReading
-from torchface.landmarks.images.find_faces import find_faces
 from torchface.landmarks.images.ibug_68 import COUNT, box_around
-from torchface.landmarks.images.landmark_finder import LandmarkFinder
-from torchface.landmarks.images.tracking.landmark_tracker import LandmarkTracker
 from torchface.landmarks.images.tracking.video_landmarks import naming_the_frame
 from torchface.progress import Progress
 from torchface.workflows.named_finders import graph_detector

@@ -18,8 +18,7 @@ from torchface.capture.own_rig.weight_walk import HIDDEN
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io.video import VideoFile
 from torchface.io.video.film_sound import sound_line
-from torchface.landmarks.images.face_reading import FaceReading
-from torchface.landmarks.images.tracking.video_landmarks import landmark_jitter
+from torchface.landmarks import FaceReading, landmark_jitter
 from torchface.rig import BlendshapeRig
 from torchface.workflows.track.person_head import PersonHead
 from torchface.workflows.track.take_solution import OFFSETS
