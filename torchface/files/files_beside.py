@@ -17,11 +17,7 @@ _AFTER_HEADER = 33  # bytes of a PNG's signature and header
 
 
 def write_beside(path: Path, parts: Mapping[str, bytes]) -> None:
-    """Writes parts of ``path``, PNG or lines of text, beside it, by name, each with a note of whose it is.
-
-    Raises:
-        FileFormatError: a file is there that torchface did not write for ``path``, or that was changed since.
-    """
+    """Writes parts of ``path``, PNG or lines of text, beside it, by name, each with a note of whose it is."""
     for name, data in parts.items():
         other = path.with_name(name)
         check_beside(path, other, data)

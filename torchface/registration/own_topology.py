@@ -29,13 +29,7 @@ def as_it_is(template: Mesh, head: Mesh) -> Registration:
 
 
 def check_own_topology(source: Mesh, target: Mesh, name: str = "neutral") -> None:
-    """Refuses a target that has the source's triangles on other points.
-
-    Raises:
-        AlignmentError: it is a mirror image of the source, or its vertices stand in another order: so many edges are
-            torn, or those of some consecutive vertices are the source's once a shift is taken back.
-        ValueRangeError: it is in another unit.
-    """
+    """Refuses a target that has the source's triangles on other points."""
     used = source.faces.cpu().unique()
     rest, goal = (mesh.vertices.detach().cpu().double()[used] for mesh in (source, target))
     size, beside = extent(goal), extent(rest)

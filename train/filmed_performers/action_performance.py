@@ -21,25 +21,15 @@ COMBINATIONS: tuple[tuple[str, ...], ...] = (("1+2", "4"), ("4", "9"), ("4", "7"
 
 @dataclass(frozen=True)
 class PerformanceSettings:
-    """How a coach runs the session.
+    """How a coach runs the session."""
 
-    Args:
-        repetitions: of each action unit alone.
-        combination_repetitions: of each combination.
-        combinations: which units are done together.
-        fps: frames a second.
-        pace: 1 is unhurried, about a second a repetition; 2 twice as fast.
-        unevenness: standard deviation by which a repetition's left and right strengths differ.
-        habits: standard deviation of this performer's own strength in each shape.
-    """
-
-    repetitions: int = 5
-    combination_repetitions: int = 3
-    combinations: tuple[tuple[str, ...], ...] = COMBINATIONS
-    fps: float = 60.0
-    pace: float = 1.0
-    unevenness: float = 0.04
-    habits: float = 0.08
+    repetitions: int = 5  # of each action unit alone
+    combination_repetitions: int = 3  # of each combination
+    combinations: tuple[tuple[str, ...], ...] = COMBINATIONS  # which units are done together
+    fps: float = 60.0  # frames a second
+    pace: float = 1.0  # 1 is unhurried, about a second a repetition; 2 twice as fast
+    unevenness: float = 0.04  # standard deviation by which a repetition's left and right strengths differ
+    habits: float = 0.08  # standard deviation of this performer's own strength in each shape
 
 
 @dataclass(frozen=True, eq=False)

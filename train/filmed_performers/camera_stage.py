@@ -36,46 +36,31 @@ SIDE_MARKERS = ("SIDE_L", "SIDE_R")
 
 @dataclass(frozen=True)
 class StageSettings:
-    """How a session is recorded.
+    """How a session is recorded."""
 
-    Args:
-        width, height: of the video, pixels.
-        markers: on the face, besides the two on its sides.
-        unsteadiness: of the painter's hand, millimetres.
-        performance: what is performed how often.
-    """
-
-    width: int = 192
-    height: int = 256
-    markers: int = 40
+    width: int = 192  # of the video, pixels
+    height: int = 256  # of the video, pixels
+    markers: int = 40  # on the face, besides the two on its sides
     flaws: CameraFlaws = field(default_factory=CameraFlaws)
     marker_flaws: StageFlaws = field(default_factory=lambda: StageFlaws(noise=0.1, standoff=MARKER_RADIUS))
-    unsteadiness: float = 0.5
-    performance: PerformanceSettings = field(default_factory=PerformanceSettings)
+    unsteadiness: float = 0.5  # of the painter's hand, millimetres
+    performance: PerformanceSettings = field(default_factory=PerformanceSettings)  # what is performed how often
 
 
 @dataclass(frozen=True, eq=False)
 class RecordedSession:
-    """The files of a session, and the truth behind them.
-
-    Args:
-        take_path: the C3D with the markers, as many frames as the video.
-        labels_path: what :func:`torchface.io.action_labels.load_action_labels` reads.
-        attachment: where the markers sit.
-        recording: the markers, and what their system did to them.
-        rotation, translation: of the camera, world to camera, (T,3,3) and (T,3).
-    """
+    """The files of a session, and the truth behind them."""
 
     video: VideoFile
-    take_path: Path
-    labels_path: Path
+    take_path: Path  # the C3D with the markers, as many frames as the video
+    labels_path: Path  # what `torchface.io.action_labels.load_action_labels` reads
     labels: ActionLabels
     rig: BlendshapeRig
-    attachment: Attachment
+    attachment: Attachment  # where the markers sit
     performance: ActionPerformance
-    recording: Recording
-    rotation: Tensor
-    translation: Tensor
+    recording: Recording  # the markers, and what their system did to them
+    rotation: Tensor  # of the camera, world to camera, (T,3,3)
+    translation: Tensor  # the same, (T,3)
 
 
 def record_session(

@@ -34,22 +34,15 @@ _REFERENCE = 220  # pixels a side that rays are cast for; the image is then made
 
 @dataclass(frozen=True)
 class FaceImageSettings:
-    """What is drawn how widely; angles in degrees.
+    """What is drawn how widely; angles in degrees."""
 
-    Args:
-        yaw, pitch, roll: standard deviations of the head's pose; none beyond 2.4 of them.
-        smallest, largest: height of the images, pixels; the face fills about half.
-        each: images of one person.
-        spread: of identities, 1 as varied as people are.
-    """
-
-    yaw: float = 20.0
-    pitch: float = 9.0
-    roll: float = 9.0
-    smallest: int = 90
+    yaw: float = 20.0  # standard deviation of the head's pose; none beyond 2.4 of them
+    pitch: float = 9.0  # as yaw
+    roll: float = 9.0  # as yaw
+    smallest: int = 90  # height of the images, pixels; the face fills about half
     largest: int = 280
-    each: int = 3
-    spread: float = 1.3
+    each: int = 3  # images of one person
+    spread: float = 1.3  # of identities, 1 as varied as people are
 
 
 @dataclass(frozen=True, eq=False)

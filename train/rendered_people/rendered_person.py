@@ -148,23 +148,15 @@ def _normals(scene: Surface, triangle: Tensor, barycentric: Tensor, ways: Tensor
 
 @dataclass(frozen=True, eq=False)
 class _SeenSurface:
-    """What R rays of a camera meet.
+    """What R rays of a camera meet."""
 
-    Args:
-        points, normals, ways: places, outward normals and the rays' directions, (R,3).
-        material: (R,).
-        albedo: linear, (R,3).
-        gloss: how much light is mirrored, (R,).
-        free: how much of the sky is open, (R,).
-    """
-
-    points: Tensor
-    normals: Tensor
-    ways: Tensor
-    material: Tensor
-    albedo: Tensor
-    gloss: Tensor
-    free: Tensor
+    points: Tensor  # (R,3)
+    normals: Tensor  # outward, (R,3)
+    ways: Tensor  # the rays' directions, (R,3)
+    material: Tensor  # (R,)
+    albedo: Tensor  # linear, (R,3)
+    gloss: Tensor  # how much light is mirrored, (R,)
+    free: Tensor  # how much of the sky is open, (R,)
 
 
 def _lit(caster: RayCaster, camera: Camera, seen: _SeenSurface, generator: torch.Generator) -> Tensor:

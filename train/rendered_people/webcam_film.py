@@ -41,31 +41,20 @@ _LOOKS = {
 
 @dataclass(frozen=True)
 class Scene:
-    """What a film shows.
+    """What a film shows."""
 
-    Args:
-        people: ``ict`` or ``performer``.
-        seed: of the person, the backdrop, the lights, the head's motion.
-        start, length: seconds of it.
-        sitting: where the person sits.
-        speech: seconds between which the mouth talks; the take's own mouth if absent.
-        away, hand: seconds at which the person turns away, and at which a hand rises to the mouth.
-        blinks: seconds at which full blinks begin besides the take's own.
-        looks: ``plain``, ``glasses``, ``beard``, ``both``, or as they are drawn if absent.
-    """
-
-    people: str
-    seed: int
+    people: str  # `ict` or `performer`
+    seed: int  # of the person, the backdrop, the lights, the head's motion
     take: int
-    start: float
-    length: float
-    sitting: SittingSettings
-    speech: tuple[float, float] | None = None
-    away: float | None = None
-    hand: float | None = None
-    blinks: tuple[float, ...] = ()
+    start: float  # seconds of it
+    length: float  # seconds of it
+    sitting: SittingSettings  # where the person sits
+    speech: tuple[float, float] | None = None  # seconds between which the mouth talks; the take's own mouth if absent
+    away: float | None = None  # seconds at which the person turns away, and at which a hand rises to the mouth
+    hand: float | None = None  # seconds at which the person turns away, and at which a hand rises to the mouth
+    blinks: tuple[float, ...] = ()  # seconds at which full blinks begin besides the take's own
     camera: WebcamSettings = field(default_factory=WebcamSettings)
-    looks: str | None = None
+    looks: str | None = None  # `plain`, `glasses`, `beard`, `both`, or as they are drawn if absent
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,23 +24,15 @@ _BLINK = (0.08, 0.03, 0.16)  # seconds to close, closed, to open
 
 @dataclass(frozen=True)
 class SittingSettings:
-    """How someone sits before the camera.
+    """How someone sits before the camera."""
 
-    Args:
-        distance: from the camera to the head, millimetres.
-        aside: of the head's middle from the optical axis, right and down, millimetres.
-        roll: of the camera, degrees.
-        yaw, pitch, tilt: standard deviations of the head's motion, degrees.
-        drift: of its place, millimetres.
-    """
-
-    distance: float = 560.0
-    aside: tuple[float, float] = (0.0, 0.0)
-    roll: float = 0.0
-    yaw: float = 9.0
-    pitch: float = 5.0
-    tilt: float = 4.0
-    drift: float = 14.0
+    distance: float = 560.0  # from the camera to the head, millimetres
+    aside: tuple[float, float] = (0.0, 0.0)  # of the head's middle from the optical axis, right and down, millimetres
+    roll: float = 0.0  # of the camera, degrees
+    yaw: float = 9.0  # standard deviations of the head's motion, degrees
+    pitch: float = 5.0  # standard deviations of the head's motion, degrees
+    tilt: float = 4.0  # standard deviations of the head's motion, degrees
+    drift: float = 14.0  # of its place, millimetres
 
 
 @dataclass(frozen=True, eq=False)

@@ -52,11 +52,7 @@ def to_trimesh(
 
 
 def from_trimesh(mesh: "trimesh.Trimesh") -> dict[str, Any]:
-    """The arguments of ``Mesh``: vertices, faces, uvs, uv_faces, colors, texture.
-
-    Raises:
-        ShapeError: not a ``Trimesh``.
-    """
+    """The arguments of ``Mesh``: vertices, faces, uvs, uv_faces, colors, texture."""
     import trimesh
 
     if not isinstance(mesh, trimesh.Trimesh):

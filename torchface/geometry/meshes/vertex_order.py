@@ -25,12 +25,7 @@ _KEEP_ORDER = "export it with the order kept (Maya, ZBrush and Blender have a se
 
 
 def check_vertex_order(name: str, rest: Tensor, goal: Tensor, faces: Tensor, other: str = "the template") -> None:
-    """Refuses vertices (V,3) in another order than ``rest`` (V,3), to which they are aligned; float64.
-
-    Raises:
-        AlignmentError: so many edges are torn, or those of some consecutive vertices are the other mesh's once a shift
-            is taken back.
-    """
+    """Refuses vertices (V,3) in another order than ``rest`` (V,3), to which they are aligned; float64."""
     ends = edges(faces)
     used = faces.unique()
     size, across = extent(goal[used]), extent(rest[used])

@@ -61,10 +61,6 @@ def webcam_module() -> WebcamGraph:
 def webcam_graph(progress: Progress | None = None) -> bytes:
     """The graph's file: from the cache where it is there and whole, else made, which takes about a minute. Parts that
     an interrupted start has made are taken.
-
-    Raises:
-        NameMismatchError: a model of the zoo is of another kind.
-        FileFormatError: a model is damaged.
     """
 
     progress = progress or silent

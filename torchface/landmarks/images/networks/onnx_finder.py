@@ -61,10 +61,6 @@ def onnx_finder(path: str | Path, limits: GraphLimits | None = None) -> CropFind
     The graph takes ``image`` (B,3,S,S) float32 in [0,1], red first: the face's box, enlarged by the number that the
     graph's metadata hold as ``crop`` (1.25 if none) and turned upright. It gives ``landmarks`` (B,68,2), their standard
     ``deviation`` (B,68), both in the crop's pixels, ``visibility`` (B,68) and ``presence`` (B,) in [0,1].
-
-    Raises:
-        FileFormatError: it is no ONNX graph, or one of other inputs and outputs, which the message names; or it takes
-            more time or memory than the limits.
     """
     path, limits = Path(path), limits or GraphLimits()
     runner = _ForeignGraph(read_file(path, _MAX_BYTES), path, limits)
