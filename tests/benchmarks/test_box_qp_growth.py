@@ -1,11 +1,9 @@
-"""How the solve grows with shapes and frames; plots to out/benchmarks/."""
+"""How the solve grows with shapes and frames."""
 
 import math
 import time
 from collections.abc import Callable
-from pathlib import Path
 
-import matplotlib
 import numpy as np
 import pytest
 import torch
@@ -16,8 +14,6 @@ from torchface import Attachment, BlendshapeRig
 from torchface.optim import BoxQP
 from torchface.synthetic.stages.marker_stage import place_markers
 
-matplotlib.use("Agg")
-OUT = Path(__file__).resolve().parents[2] / "out" / "benchmarks"
 PEERS: dict[str, Callable[[np.ndarray], Solver]] = {
     "PIQP": piqp_solver,
     "DAQP": daqp_solver,
@@ -97,8 +93,8 @@ def worst_residual(H: Tensor, f: Tensor) -> float:
     return float((x - (x - bent / H.diagonal()).clamp(0, 1)).abs().max())
 
 
-def growth(problems: dict[int, tuple[Tensor, Tensor]]) -> tuple[list[float], dict[str, list[float]]]:
-    """Milliseconds a frame by number of shapes, ours and theirs, as printed."""
+def growth(problems: dict[int, tuple[Tensor, Tensor]]) -> None:
+    """Prints milliseconds a frame by number of shapes, and holds ours against theirs."""
     # The two that are slow from the start take minutes where there are many shapes.
     peers = {name: make for name, make in PEERS.items() if installed(name.lower())}
     ours: list[float] = []
@@ -117,7 +113,6 @@ def growth(problems: dict[int, tuple[Tensor, Tensor]]) -> tuple[list[float], dic
         # Between 53 and 140 shapes the fastest, DAQP, is nearer; the machine's other work moves the ratio by a third.
         least = 4.5 if count > 140 else 2.5 if count == 140 else 0.7
         assert min((other for other in others if not math.isnan(other)), default=math.inf) >= least * mine
-    return ours, theirs
 
 
 @pytest.mark.real
@@ -137,7 +132,7 @@ def test_growth_of_a_real_rig_by_copies(
 def test_growth_with_shapes_and_frames(print_machine: Callable[..., None]) -> None:
     shapes = [16, 32, 53, 100, 140, 200, 280, 600]
     print_machine("piqp", "daqp", "osqp", "quadprog")
-    ours, theirs = growth({count: blendshape_problem(count, 1000) for count in shapes})
+    growth({count: blendshape_problem(count, 1000) for count in shapes})
     frames = [1, 10, 100, 1000, 10_000, 100_000]
     by_frame = []
     H, f = blendshape_problem(53, frames[-1])
@@ -145,23 +140,6 @@ def test_growth_with_shapes_and_frames(print_machine: Callable[..., None]) -> No
     for count in frames:
         by_frame.append(milliseconds(H, f[:count]))
         print(f"{count:7} {by_frame[-1]:9.4f}")
-
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(10, 4), layout="constrained")
-    by_shape, by_batch = figure.subplots(1, 2)
-    by_shape.loglog(shapes, ours, "o-", label="torchface float32, 1,000 frames")
-    by_batch.loglog(frames, by_frame, "o-", label="torchface float32, 53 shapes")
-    for color, (name, spent) in enumerate(theirs.items(), start=1):
-        by_shape.loglog(shapes, spent, "s--", color=f"C{color}", label=f"{name}, a frame at a time")
-        by_batch.axhline(spent[shapes.index(53)], linestyle="--", color=f"C{color}", label=name)
-    by_shape.set(xlabel="shapes", ylabel="milliseconds a frame", xticks=shapes, xticklabels=shapes)
-    by_shape.minorticks_off()
-    by_batch.set(xlabel="frames in a batch", ylabel="milliseconds a frame")
-    for axes in (by_shape, by_batch):
-        axes.legend()
-    OUT.mkdir(parents=True, exist_ok=True)
-    figure.savefig(OUT / "box_qp_growth.png", dpi=120)
 
     # Large batches cost no more a frame than middling ones: memory stays bounded.
     assert by_frame[-1] <= 2 * min(by_frame)

@@ -1,9 +1,7 @@
 """The sparsity experiment of the thesis's figure 74 on real takes, and what the rule for the weight gives."""
 
 from dataclasses import dataclass
-from pathlib import Path
 
-import matplotlib
 import pytest
 import torch
 from torch import Tensor
@@ -14,9 +12,6 @@ from torchface.capture import MarkerSolver
 from torchface.capture.markers import observability
 from torchface.capture.markers.marker_solver import SPARSITY
 from torchface.capture.markers.take_smoothing import with_sparsity
-
-matplotlib.use("Agg")
-OUT = Path(__file__).resolve().parents[2] / "out" / "benchmarks"
 
 
 @dataclass(frozen=True)
@@ -63,33 +58,6 @@ def test_sparsity_on_real_takes(real_capture: tuple[BlendshapeRig, Attachment, l
     for trial in trials:
         print(f"{trial.sparsity:9.3f} {trial.active:7.1f} {trial.weight_sum:6.2f} "
               f"{trial.marker_error:11.3f} {trial.weight_error:8.4f}")  # fmt: skip
-
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 4), layout="constrained")
-    counts, errors, frame = figure.subplots(1, 3)
-    shown = [max(trial.sparsity, 1e-3) for trial in trials]
-    counts.semilogx(shown, [trial.active for trial in trials], "o-")
-    counts.axhline(true_active, linestyle="--", color="gray", label="true")
-    counts.set(xlabel="sparsity, mm² a marker (left: none)", ylabel="active shapes")
-    errors.semilogx(shown, [trial.marker_error for trial in trials], "o-", label="markers, mm")
-    errors.semilogx(shown, [trial.weight_error for trial in trials], "s-", label="weights")
-    errors.set(xlabel="sparsity, mm² a marker (left: none)", ylabel="root mean square error")
-    for axes in (counts, errors):
-        axes.axvspan(min(by_rule), max(by_rule), alpha=0.2, color="C2", label="the rule, six takes")
-        axes.legend()
-    row = int(truth.sum(-1).argmax())
-    without, with_it = (
-        MarkerSolver(rig, layout, sparsity=s)(points[row : row + 1])[0].numpy() for s in (0.0, SPARSITY)
-    )
-    places = range(len(rig.names))
-    frame.bar(places, without, width=1.0, color="C1", label="without")
-    frame.bar(places, with_it, width=0.5, color="C0", label="with")
-    frame.plot(places, truth[row].numpy(), "k.", markersize=4, label="true")
-    frame.set(xlabel="shape", ylabel="weight", title="the busiest frame")
-    frame.legend()
-    OUT.mkdir(parents=True, exist_ok=True)
-    figure.savefig(OUT / f"sparsity_{count}_markers.png", dpi=120)
 
     chosen = trials[sparsities.index(SPARSITY)]
     assert chosen.active < trials[0].active

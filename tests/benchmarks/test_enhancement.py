@@ -29,7 +29,6 @@ from enhancement_comparison import (
     measure,
     shares,
 )
-from enhancement_pictures import compared
 from enhancement_scenes import FPS
 
 from torchface.enhancement.matching.region_projection import RegionProjection
@@ -125,8 +124,8 @@ def test_bars(bench: Bench, measured: Measured) -> None:
         assert own.fine <= 0.15
 
 
-def test_pictures(bench: Bench) -> None:
-    """The liveliest frame of each test take, drawn: ours is near the truth where the smooth input lacks most."""
+def test_the_liveliest_frames(bench: Bench) -> None:
+    """Of each test take: ours is near the truth where the smooth input lacks most."""
     for number, (coarse, truth) in enumerate(zip(bench.scene.coarse, bench.scene.truth, strict=True)):
         lacking = bench.ruler.fine(bench.smooth(coarse) - truth).square().sum((1, 2))
         frame = int(lacking.argmax())
@@ -136,7 +135,6 @@ def test_pictures(bench: Bench) -> None:
         columns["truth"] = truth[frame]
         errors = {name: bench.ruler.fine((shown - truth[frame])[None])[0].norm(dim=1)
                   for name, shown in columns.items() if name != "truth"}  # fmt: skip
-        compared(f"{bench.scene.name}, test take {number}", bench.scene.performer.neutral, columns, errors)
         sizes = {name: float(error.square().mean().sqrt()) for name, error in errors.items()}
         print(f"{bench.scene.name}, test take {number}: " + ", ".join(f"{n} {v:.4f} mm" for n, v in sizes.items()))
         assert sizes[LEARNED] < 0.3 * sizes["smooth input"]
@@ -202,6 +200,3 @@ def test_outside_the_range(bench: Bench) -> None:
         assert rows[LEARNED + PAIRS].fine < rows[INPUT].fine
         outside = bench.model.enhance(coarse).outside
         print(f"said to be outside: {float(outside.float().mean()):.0%} of regions and frames")
-        frame = int(bench.ruler.fine(truth - coarse).square().sum((1, 2)).argmax())
-        columns = {INPUT: coarse[frame]} | {name: bench.methods[name](coarse[frame][None])[0] for name in SHOWN}
-        compared(f"{bench.scene.name}, {what}", performer.neutral, columns | {"truth": truth[frame]})

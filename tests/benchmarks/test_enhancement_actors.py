@@ -6,7 +6,6 @@ import pytest
 import torch
 from enhancement_measures import Ruler
 from enhancement_peers import Method
-from enhancement_pictures import compared
 from enhancement_scenes import FPS, Scene, scene_of
 from torch import Tensor
 
@@ -76,13 +75,6 @@ def test_another_actors_detail(data: Path, seed: int, places: str) -> None:
             found.setdefault(name, []).extend(torch.stack(some).mean(0).tolist())
     for name, figures in found.items():
         print(f"{name:40s}" + "".join(f"{value:10.3f}" for value in figures))
-    coarse, truth = taker.coarse[1], taker.truth[1]
-    frame = int((truth - coarse).square().sum((1, 2)).argmax())
-    columns = {"coarse": coarse[frame]}
-    for kind, (his, own) in models.items():
-        columns["another actor's model" + kind] = his.on_actor(taker.neutral)(coarse[frame][None])[0]
-        columns["own model" + kind] = own(coarse[frame][None])[0]
-    compared(f"another actor's detail, own {places}", taker.performer.neutral, columns | {"truth": truth[frame]})
     none, his, own = (
         found[name]
         for name in ("coarse animation itself", "another actor's model, from pairs", "own model, from pairs")

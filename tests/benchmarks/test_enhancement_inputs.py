@@ -24,8 +24,6 @@ from enhancement_comparison import (
     shares,
     total,
 )
-from enhancement_measures import Known
-from enhancement_pictures import compared
 from enhancement_scenes import FPS
 from torch import Tensor
 
@@ -156,7 +154,6 @@ def test_sources(bench: Bench) -> None:
         ])  # fmt: skip
         rows.append(bench.ruler.shares(best, measured.smooth, measured.flicker))
         print(f"{source:32s}" + "".join(f"{row.fine:14.3f} {row.angle:7.3f}" for row in rows))
-        draw(both, source, coarse[1], known[1])
         if source not in KEPT:
             assert rows[-2].fine < min(rows[2].fine, 0.75)
 
@@ -165,16 +162,6 @@ def truths_detail(bench: Bench, coarse: Tensor, truth: Tensor) -> Tensor:
     """The smooth part of coarse frames with the truth's fine part."""
     detail, low = bench.database.detail, bench.smooth(coarse)
     return detail.compose(low, detail.encode(bench.smooth(truth), truth))
-
-
-def draw(bench: Bench, source: str, coarse: Tensor, known: Known) -> None:
-    """The frame with the most to add."""
-    frame = int(bench.ruler.fine(bench.smooth(coarse) - known.truth).square().sum((1, 2)).argmax())
-    columns = {INPUT: coarse[frame]}
-    shown = [name for name in (OURS, LEARNED, LEARNED + PAIRS, OWN, MOTION) if name in bench.methods]
-    columns |= {name: bench.methods[name](coarse[frame][None])[0] for name in shown}
-    columns["truth"] = known.truth[frame]
-    compared(f"{bench.scene.name}, {source}", bench.scene.performer.neutral, columns)
 
 
 def test_restored_frames(bench: Bench) -> None:
@@ -206,4 +193,3 @@ def test_blends_of_two_frames(bench: Bench) -> None:
     active = float((used > 0.02).sum(2).float().mean())
     print(f"frames that take part in a region: {active:.1f} on average (figure 11)")
     assert 4 < active < 12
-    draw(bench, "halfway between two frames (6)", performer.smooth(weights), known[0])

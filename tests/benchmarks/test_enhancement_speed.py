@@ -10,13 +10,10 @@ from functools import partial
 
 import pytest
 import torch
-from enhancement_pictures import FOLDER, save
-from matplotlib.figure import Figure
 from torch import Tensor
 
 from torchface.enhancement import CapturedPerformance, EnhancementModel
 from torchface.enhancement.thin_shell import ThinShell
-from torchface.rendering.compositing import from_figure
 from torchface.synthetic.stages.wrinkles import WrinkledPerformer
 
 SIZES = {100_000: 0.2, 500_000: 1.0}
@@ -114,14 +111,4 @@ def test_growth() -> None:
     print(f"\n{'vertices':>9s}{'database':>10s}{'ms a frame':>12s}")
     for vertices, count, value in rows:
         print(f"{vertices:9,d}{count:10d}{value:12.1f}")
-    if FOLDER is not None:
-        figure = Figure(figsize=(8, 3.5))
-        by_count, by_size = figure.subplots(1, 2)
-        by_count.plot([row[1] for row in rows[:3]], [row[2] for row in rows[:3]], "o-")
-        by_count.set(xlabel="database frames, 20,000 vertices", ylabel="ms a frame", ylim=(0, None))
-        several = [rows[0], *rows[3:]]
-        by_size.plot([row[0] for row in several], [row[2] for row in several], "o-")
-        by_size.set(xlabel="vertices, 50 database frames", ylim=(0, None))
-        figure.tight_layout()
-        save(from_figure(figure), "growth")
     assert rows[2][2] < 8 * rows[0][2]

@@ -4,8 +4,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import matplotlib
-import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 import torch
@@ -19,8 +17,6 @@ from torchface.io import load_take
 from torchface.shape_names import mapping
 from torchface.synthetic.head.performer import performer
 
-matplotlib.use("Agg")
-OUT = Path(__file__).resolve().parents[2] / "out" / "benchmarks"
 FPS = 60.0  # of the takes
 REGIONS = {
     "brows": ("forehead", "brow_left", "brow_right"),
@@ -189,29 +185,13 @@ def test_the_default_is_what_is_better_on_takes_left_out_of_the_database(regions
 @pytest.mark.real
 def test_displacement_curves_of_a_motion_that_was_left_out(regions: list[Motions]) -> None:
     """The paper's figure 7: linear, matched and actor, of the median of the left lids' motions and of the mouth's."""
-    figure, axes = plt.subplots(2, 2, figsize=(10, 6), layout="constrained")
     print(
         f"\ndistance from the actor's displacement, share of the way\n{'region':>13}"
         + "".join(f"{w:>16}" for w in WAYS)
     )
-    for name, (left, right) in zip(("left lids", "mouth"), axes, strict=True):
+    for name in ("left lids", "mouth"):
         region = next(region for region in regions if region.name == name)
         shown = list(courses(region, (0, 1, 2, 3), (4, 5)))
         errors = np.array([[root_mean_square((curve - own).numpy()) for curve in curves] for own, curves in shown])
         print(f"{name:>13}" + "".join(f"{error:>16.3f}" for error in errors.mean(0)))
-        ratio = errors[:, -1] / errors[:, 0]
-        own, curves = shown[int(np.argsort(ratio)[len(ratio) // 2])]
-        drawn = dict(zip(WAYS, curves, strict=True)) | {"actor": own}
-        seconds = np.arange(len(own)) / FPS
-        for label, curve in drawn.items():
-            line = {"color": "black", "linewidth": 2} if label == "actor" else {}
-            left.plot(seconds, curve, label=label, **line)
-            right.plot((np.arange(40) + 0.5) / 40 * seconds[-1], profile(curve, 0.05), label=label, **line)
-        left.set(title=f"{name}: displacement", xlabel="seconds", ylabel="share of the way")
-        right.set(title=f"{name}: velocity", xlabel="seconds", ylabel="of the mean")
         assert errors.mean(0)[-1] < errors.mean(0)[0]
-    axes[0, 0].legend()
-    OUT.mkdir(parents=True, exist_ok=True)
-    figure.savefig(OUT / "displacement_curves.png", dpi=80)
-    plt.close(figure)
-    print(f"drawn in {OUT / 'displacement_curves.png'}")

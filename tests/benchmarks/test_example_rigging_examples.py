@@ -24,15 +24,11 @@ from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
 from torchface.optim import box_qp
-from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, heat_colors, save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.weight_curves import perform
-from torchface.viz.figures.face_views import THREE_QUARTER, frame_face
 
-PICTURES = Path("out/example_rigging")
 GUESSED = RiggingSchedule(gamma=(25.0, 25.0))
 
 
@@ -161,28 +157,7 @@ def table(cases: list[Case]) -> list[Measured]:
         rows.append(measure(case, "true", truth))
         measure(case, "guessed", guesses(truth, number))
         measure(case, "guessed, loose", guesses(truth, number), GUESSED)
-        if number == 0:
-            pictures(case, rows[0].made)
     return rows
-
-
-def pictures(case: Case, made: ExampleRig) -> None:
-    """The person, the transferred and the personal rig in two examples and two unseen expressions."""
-    weights = torch.cat([example_weights(case.template.names)[:2], case.unseen[[4, 12]]])
-    goals, neutral, cells = case.person(weights), case.person.neutral, []
-    clay = torch.full((len(neutral.vertices), 3), 0.75)
-    camera = frame_face(neutral, THREE_QUARTER, width=240, height=300)
-    for i, goal in enumerate(goals):
-        poses = {"true": goal}
-        for name, rig in (("transferred", made.transferred), ("personal", made.rig)):
-            poses[name] = rig(best_weights(rig, goals[i : i + 1]))[0]
-        for name, pose in poses.items():
-            view = render(neutral.with_vertices(pose), camera, clay)
-            cells.append(caption(view, f"{name}: {'example' if i < 2 else 'unseen'}"))
-        for name, pose in list(poses.items())[1:]:
-            heat = heat_colors((pose - goal).norm(dim=-1), 2.0)
-            cells.append(caption(render(neutral.with_vertices(goal), camera, heat), f"{name}, 2 mm is red"))
-    save_rendered_image(sheet(cells, 5), PICTURES / f"{case.name.replace(' ', '_')}.png")
 
 
 def hold(rows: list[Measured]) -> None:

@@ -1,10 +1,10 @@
 """The hybrid solve where markers are blind: errors against the markers alone, jerk, frames side by side.
 
 Films a performer who trains the classifier, and takes of that performer and of another, which takes minutes; the films
-stay in ``out/hybrid/films`` for the next run, pictures come in ``out/hybrid``.
+stay in ``out/hybrid/films`` for the next run.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -17,11 +17,8 @@ from torchface.capture import ActionUnitClassifier, CurveSettings, HybridSolver,
 from torchface.capture.action_units import GROUPS, ActionUnitCurves, action_unit_curves, load_shape_table, read_regions
 from torchface.capture.action_units.classifier import group_regions
 from torchface.capture.markers import gamma_curves, rest_residual
-from torchface.geometry.cameras.pinhole import look_at
 from torchface.io.action_labels import ActionLabels, load_action_labels
 from torchface.io.video import open_video
-from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, save_rendered_image, sheet
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.marker_stage import StageFlaws
 from train.filmed_performers.action_performance import MOVES, PerformanceSettings
@@ -199,7 +196,6 @@ def test_where_markers_are_blind(classifier: ActionUnitClassifier, number: int) 
         if float((found.alone - true)[:, i].abs().mean()) > 0.005
     }
     print("others worse by more than 5 %:", {name: round(ratio, 2) for name, ratio in grown.items() if ratio > 1.05})
-    save_rendered_image(side_by_side(found), OUT / f"blind{number}.png")
 
 
 def test_the_shipped_classifier_where_markers_are_blind() -> None:
@@ -215,27 +211,6 @@ def test_54_markers_on_the_upper_face(classifier: ActionUnitClassifier) -> None:
     print(f"\n{len(one.attachment.triangles)} markers, 54 of them on the upper face")
     found = solved(classifier, one, None)
     led, others = shares(found)
-    save_rendered_image(side_by_side(found), OUT / "upper.png")
     assert led <= 1
     assert others <= 1.05
     assert jerk(found.hybrid) <= jerk(found.alone)
-
-
-def side_by_side(found: Solved) -> Tensor:
-    """For each led unit the frame of its greatest intensity: video, markers alone, hybrid, truth."""
-    one = found.film
-    video = open_video(one.video)
-    rig = performer(one.identity, texture=True)
-    camera = look_at(rig.vertices.mean(0), 0.0, 0.0, 210.0, 300, 400)
-    faces = []
-    for unit in LED:
-        stretches = [stretch for stretch in one.labels.performed if stretch.units == (unit,)]
-        rows = [rig.names.index(name) for name in MOVES[unit]]
-        frames = torch.cat([torch.arange(stretch.first, stretch.last) for stretch in stretches])
-        frame = int(frames[one.weights[frames][:, rows].sum(1).argmax()])
-        grey = torch.nn.functional.interpolate(video.frame(frame)[None, None].float() / 255, (400, 300), mode="area")
-        faces.append(caption(grey[0].expand(3, -1, -1), f"AU {unit}, frame {frame}"))
-        for name, weights in (("markers alone", found.alone), ("hybrid", found.hybrid), ("truth", one.weights)):
-            mesh = replace(rig.neutral, vertices=rig(weights[frame][None])[0])
-            faces.append(caption(render(mesh, camera), name))
-    return sheet(faces, 4)

@@ -20,7 +20,6 @@ from torchface.synthetic import draw_identities, neutral_head, performer
 
 pytestmark = pytest.mark.slow
 
-OUT = Path(__file__).resolve().parents[2] / "out" / "training_growth"
 COUNTS, TAKES, PICTURES = (5000, 7500, 10000), (1250, 2500, 5000), (3600, 7200, 14400)
 COMPONENTS, FRAMES, STEPS, BATCH = 20, 200, 12, 16
 EXPRESSIONS = ("jawOpen", "mouthSmileLeft")
@@ -112,9 +111,7 @@ tell(begin, start)
 
 
 def trained(what: str, script: str, counts: Sequence[int], *words: object) -> list[Found]:
-    """What training took, count by count; told and drawn."""
-    from matplotlib.figure import Figure
-
+    """What training took, count by count."""
     told: list[Found] = []
     for count in counts:
         run = [sys.executable, "-c", MEASURE + script, str(count), *(str(word) for word in words)]
@@ -124,14 +121,6 @@ def trained(what: str, script: str, counts: Sequence[int], *words: object) -> li
             f"\n{count} {what}: {found['seconds']:.1f} processor seconds, {found['passes']:.0f} passes, "
             f"peak {found['gib']:.2f} GiB, of which {found['own']:.2f} the training's"
         )
-    figure = Figure(figsize=(7, 3), layout="constrained")
-    for place, (name, key) in enumerate((("processor seconds", "seconds"), ("peak GiB", "gib")), 1):
-        axes = figure.add_subplot(1, 2, place)
-        axes.plot(counts, [found[key] for found in told], "o-")
-        axes.set(xlabel=what, ylabel=name, xlim=(0, None), ylim=(0, 1.1 * max(found[key] for found in told)))
-    OUT.mkdir(parents=True, exist_ok=True)
-    figure.savefig(OUT / f"{what}.png")
-    print(OUT / f"{what}.png")
     return told
 
 

@@ -14,14 +14,11 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.meshes.deformation import deformation_gradients
 from torchface.geometry.meshes.operators import border_vertices, components, edges, triangle_normals, vertex_normals
 from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import CONTACT_WEIGHT, transfer_with_report
-from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
 
 pytestmark = pytest.mark.real
@@ -32,7 +29,6 @@ LIP_POSES = {
     "mouthPucker": [0, 0, 0, 0, 1, 0, 0],
     "0.3 (jawOpen+mouthClose)": [0, 0, 0, 0, 0, 0.3, 0.3],
 }
-PICTURES = Path("out/benchmarks/transfer")
 
 
 def rings(mesh: Mesh, start: Tensor, count: int) -> list[Tensor]:
@@ -145,7 +141,6 @@ def test_lids_and_lips_of_twenty_random_heads(template: BlendshapeRig, ict_folde
     lips = Lips(template, openings(template.neutral)[2])
     table: dict[float, list[list[float]]] = {0.0: [], CONTACT_WEIGHT: []}
     flips: dict[float, list[int]] = {0.0: [], CONTACT_WEIGHT: []}
-    pictures: list[Tensor] = close_ups(template, "template", lids[0], lips)
     for seed in range(20):
         generator = np.random.default_rng(seed)
         head = modes.head(torch.from_numpy(generator.standard_normal(len(modes.names))).float())
@@ -159,9 +154,6 @@ def test_lids_and_lips_of_twenty_random_heads(template: BlendshapeRig, ict_folde
                 row.append(float((change - expected).max()))
             table[weight].append(row)
             flips[weight].append(sum(flipped(template, rig, lid.blink) for lid in lids))
-            if seed in (6, 14):
-                pictures += close_ups(rig, f"head {seed}, {'with' if weight else 'without'}", lids[0], lips)
-    save_rendered_image(sheet(pictures, 5), PICTURES / "contact.png")
     heading = ["lids, left", "lids, right", *LIP_POSES]
     print(f"\nexcess over the template's gap, mm: 20 heads ({len(lips.upper)} pairs of lip vertices)")
     print(f"{'':28s}{'without contact':>32s}{'with contact':>32s}")
@@ -176,19 +168,6 @@ def test_lids_and_lips_of_twenty_random_heads(template: BlendshapeRig, ict_folde
     assert with_contact[:, 2:].max() <= 0.3
     assert without[:, :2].max() > 1.0
     assert newly <= 0
-
-
-def close_ups(rig: BlendshapeRig, name: str, lid: Lid, lips: Lips) -> list[Tensor]:
-    eye, mouth = rig.vertices[lid.upper].mean(0), rig.vertices[lips.upper].mean(0)
-    poses = {"eyeBlink": [1.0, 0, 0, 0, 0, 0, 0], "lips at rest": [0.0] * 7, **LIP_POSES}
-    images = []
-    for what, weights in poses.items():
-        camera = look_at(eye, 15, span=45, width=240, height=180)
-        if what != "eyeBlink":
-            camera = look_at(mouth, 0, span=60, width=240, height=180)
-        image = render(rig.neutral.with_vertices(posed(rig, weights)), camera)
-        images.append(caption(image, f"{name}: {what}", 10))
-    return images
 
 
 @pytest.mark.parametrize(("part", "limit"), [("face", 2.0), (None, 6.0)])

@@ -18,13 +18,11 @@ from torchface.landmarks import (
     scan_landmarks,
     uv_landmarks_from_ibug,
 )
-from torchface.rendering.compositing import save_rendered_image, sheet
 from train.annotated_scans import AnnotatedScan, scanned_performers
-from train.scan_landmark_errors import draw_result, error_table, landmark_errors
+from train.scan_landmark_errors import error_table, landmark_errors
 from train.uv_landmarks import fit
 
 LEARN, TEST = 30, 20
-PICTURES = Path("out/landmarks")
 
 
 @pytest.fixture(scope="module")
@@ -45,13 +43,12 @@ def test_landmarks_of_scanned_performers(
     scans: list[AnnotatedScan],
     detectors: dict[str, UVLandmarkDetector],
 ) -> None:
-    errors, pictures, spent = [], [], 0.0
+    errors, spent = [], 0.0
     for scan in scans[LEARN:]:
         begin = time.perf_counter()
         found = scan_landmarks(detectors[kind], scan.mesh)
         spent += time.perf_counter() - begin
         errors.append(landmark_errors(found, scan.mesh, scan.truth))
-        pictures.append(draw_result(found, scan.truth))
     print(f"\n{kind}: learned from {LEARN} scanned performers, tested on {TEST} others, {spent / TEST:.1f} s a scan")
     table = error_table(errors)
     for what, value in table.items():
@@ -59,7 +56,6 @@ def test_landmarks_of_scanned_performers(
     each = torch.stack([one.pixels for one in errors]).nanmean(0)
     for name, value in zip(UV_LANDMARK_NAMES, each.tolist(), strict=True):
         print(f"    {name:30}{value:8.2f}")
-    save_rendered_image(sheet(pictures[:6], 3), PICTURES / f"performers_{kind}.png")
     assert table["mean error, pixels"] <= limit
     if line_limit is not None:
         assert max(table[f"{line}, pixels"] for line in ("right_lids", "left_lids", "lips")) <= line_limit
@@ -81,10 +77,9 @@ def test_landmarks_of_a_real_scan(kind: str, data: Path, detectors: dict[str, UV
     usual, _ = found.head.surface_points(scan, detectors[kind].prior_mean)
     alone = float((usual.double() - twelve).norm(dim=-1)[inner].mean())
     print(f"\nreal scan, {kind} learned from scanned performers: {mean:.2f} mm over eyes, nose and mouth")
-    print(f"    the face frame alone, without looking at the draw_result: {alone:.2f} mm")
+    print(f"    the face frame alone, without looking at the image: {alone:.2f} mm")
     for name, value, sure in zip(
         UV_LANDMARK_NAMES, errors.millimetres.tolist(), found.confidence.tolist(), strict=True
     ):
         print(f"    {name:24}{value:8.2f} mm, confidence {sure:.3f}")
-    save_rendered_image(draw_result(found, truth), PICTURES / f"real_scan_{kind}.png")
     assert mean <= {"texture": 3.5, "curvature": 6.0}[kind]

@@ -6,12 +6,9 @@ import pytest
 import torch
 
 from torchface.capture import ShapePrior, VideoSolver
-from torchface.io import load_identity_modes, load_rig, load_take, save_animation
+from torchface.io import load_identity_modes, load_rig, load_take
 from torchface.modeling import FitSettings, HeadModel, MorphableModel, fit_images
-from torchface.rendering.clay_shading import render
-from torchface.rendering.compositing import caption, save_rendered_image, sheet
 from torchface.rig import BlendshapeRig
-from torchface.take import Take, Track
 
 pytestmark = pytest.mark.real
 
@@ -20,8 +17,7 @@ pytestmark = pytest.mark.real
 def test_real_landmarks_move_the_real_rig(data: Path, ict_folder: Path, performances: list[Path]) -> None:
     rig = load_rig(ict_folder, part="face")
     takes = [rig.weights_from(load_take(path).weights).clamp(0, 1) for path in performances[:3]]
-    take = load_take(data / "landmarks" / "openface_100_frames.csv")
-    landmarks, fps = take.landmarks.values, take.fps
+    landmarks = load_take(data / "landmarks" / "openface_100_frames.csv").landmarks.values
     modes = load_identity_modes(ict_folder, part="face").deltas[:12]
     sizes = modes.flatten(1).norm(dim=1)
     model = HeadModel.on(rig.neutral, MorphableModel(rig.vertices, modes / sizes[:, None, None], sizes))
@@ -41,20 +37,3 @@ def test_real_landmarks_move_the_real_rig(data: Path, ict_folder: Path, performa
     assert float(errors.mean()) < 0.06
     assert float(still[0].mean()) < 0.75
     assert float(still[1].mean()) < 0.03
-    pictures = Path("out/video_solver")
-    pictures.mkdir(parents=True, exist_ok=True)
-    save_animation(actor, Take(fps, weights=Track(rig.names, solution.weights[..., None])), pictures / "openface.glb")
-    cells = []
-    for t in (0, 13, 26, 39):
-        camera = fit.cameras[0]
-        camera = type(camera)(
-            camera.intrinsics, solution.rotation[t].double(), solution.translation[t].double(), *image_size
-        )
-        posed = actor.neutral.with_vertices(actor(solution.weights[t : t + 1])[0])
-        picture = render(posed, camera, samples=1)
-        for x, y in landmarks[t].round().long().tolist():
-            picture[:, max(y - 1, 0) : y + 2, max(x - 1, 0) : x + 2] = torch.tensor([1.0, 0.1, 0.1])[:, None, None]
-        low, high = landmarks[t].amin(0).long() - 60, landmarks[t].amax(0).long() + 60
-        cut = picture[:, max(int(low[1]), 0) : int(high[1]), max(int(low[0]), 0) : int(high[0])]
-        cells.append(caption(cut, f"frame {t}"))
-    save_rendered_image(sheet(cells, 4), pictures / "openface.png")
