@@ -12,7 +12,7 @@ from torchface.capture import HybridSolver, MarkerSolver
 from torchface.correctives import Corrective, Correctives
 from torchface.errors import ValueRangeError
 from torchface.landmarks.images.graph_session import graph_session
-from torchface.onnx import SolverGraph, export_solver
+from torchface.onnx import SolverGraph
 from torchface.onnx.corrective_graph import CorrectiveGraph
 from torchface.onnx.solver_graph_export import export_marker_solver, hide_markers, random_frames, solver_model
 from torchface.synthetic import performer
@@ -100,17 +100,6 @@ def test_onnx_runtime_computes_products_of_up_to_eight_shapes(solver: MarkerSolv
     torch.testing.assert_close(torch.from_numpy(found)[2], start[2])
     exact = MarkerSolver(rig, attachment, sparsity=0.0, ridge=1e-9)(full.points(weights).float())
     assert (exact - weights).abs().max() < 1e-3
-
-
-@pytest.mark.bench
-def test_a_hybrid_file_is_written_and_checked(tmp_path: Path) -> None:
-    whole = performer(texture=False)
-    rig = whole.select(["jawOpen", "mouthPucker", "mouthSmileLeft", "mouthSmileRight"])
-    rig = BlendshapeRig(rig.neutral, rig.deltas, rig.names, planted_correctives(rig, 3))
-    sites = Attachment.from_vertices(rig.neutral, rig.neutral.landmarks)
-    report = export_solver(rig, sites, tmp_path / "a.onnx", hybrid=True)
-    assert all(gap.parity < 1e-5 for gap in report.gaps)
-    print(report)
 
 
 @pytest.mark.bench

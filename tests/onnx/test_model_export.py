@@ -161,6 +161,7 @@ def test_infinite_deviations_agree_and_others_are_a_gap(tmp_path: Path) -> None:
     assert report.parity == {"y": 0.0}
     with pytest.raises(ValueRangeError, match="differ from PyTorch's by"):
         write_checked(model, tmp_path / "x.onnx", [(x, {"y": torch.tensor([9.0, 2.0])})], {"y": 1e-3}, units)
+    assert not (tmp_path / "x.onnx").exists()
 
 
 @pytest.mark.bench

@@ -1,8 +1,6 @@
 """A folder of animations is enhanced as each alone, whatever else lies in it."""
 
 import csv
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
@@ -50,13 +48,3 @@ def test_a_folder_of_animations_is_enhanced_as_each_alone(
     one, many = (tmp_path / name / "enhanced.safetensors" for name in ("alone", "many/loud"))
     assert len(MeshSequence(one)) == 4
     assert one.read_bytes() == many.read_bytes()
-
-
-@pytest.mark.bench  # two processes load the library
-def test_two_processes_enhance_as_one(actor: Actor, takes: Path, tmp_path: Path) -> None:
-    (takes / "other.csv").unlink()
-    with ProcessPoolExecutor(1, get_context("spawn")) as other:  # a new process draws in full, as its children do
-        other.submit(enhance, actor, takes, tmp_path / "one", "--quiet").result()
-        other.submit(enhance, actor, takes, tmp_path / "two", "--jobs", "2", "--quiet").result()
-    for name in ("calm/enhanced.safetensors", "loud/enhanced.safetensors", "calm/frames.csv", "contact_sheet.png"):
-        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()

@@ -1,8 +1,6 @@
 """From scans on disk to an actor's rig on disk: what was planted comes back."""
 
-from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
-from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
@@ -142,15 +140,6 @@ def test_a_folder_of_actors_is_rigged_as_each_alone(
     files = (actor.folder / "neutral.ply", actor.folder / "template.glb", tmp_path / "neutral.glb")
     rig_actor(*files, actor.folder / "neutral.json")
     assert files[2].read_bytes() == (tmp_path / "rigs" / "neutral.glb").read_bytes()
-
-
-@pytest.mark.bench  # two processes load the library
-def test_two_processes_rig_as_one(actor: Actor, tmp_path: Path) -> None:
-    with ProcessPoolExecutor(1, get_context("spawn")) as other:  # a new process draws in full, as its children do
-        names = other.submit(rig_folder, actor, tmp_path / "one").result()
-        assert other.submit(rig_folder, actor, tmp_path / "two", "--jobs", "2").result() == names
-    for name in ("neutral.glb", "neutral_registration.png", "contact_sheet.png"):
-        assert (tmp_path / "one" / name).read_bytes() == (tmp_path / "two" / name).read_bytes()
 
 
 def test_a_model_of_heads_holds_the_sliding(actor: Actor, tmp_path: Path) -> None:
