@@ -1,7 +1,6 @@
 """A template bent onto scans whose true correspondence is known."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -262,19 +261,6 @@ def test_parts_that_share_no_vertex_follow(
     assert 0.8 < float(scale.min()) <= float(scale.max()) < 1.25
     laid = result.pose.apply(bead)[0]
     assert float((end - laid).norm(dim=1).max()) < 8.0
-
-
-@pytest.mark.bench  # a planted deformation of the mask is recovered above
-@pytest.mark.real
-def test_a_head_of_the_identity_modes_is_recovered(ict_folder: Path, rescanned: Callable[..., Mesh], moved) -> None:
-    modes = load_identity_modes(ict_folder, part="face")
-    template, generator = modes.neutral, torch.Generator().manual_seed(1)
-    truth = moved(modes.head(torch.randn(len(modes.names), generator=generator)).vertices.double(), 6)
-    scan = rescanned(template.with_vertices(truth.float()), noise=0.1)
-    result = register(template, scan, (template.landmarks, truth[template.landmarks]))
-    assert float(error(result, truth).mean()) < 0.9
-    assert float(result.distance.mean()) < 0.1
-    assert turned_over(result, template) == 0
 
 
 @dataclass(eq=False)

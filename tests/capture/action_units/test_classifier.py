@@ -104,13 +104,6 @@ def test_units_performed_once_cannot_be_left_out(regions: RegionVideo, session: 
         cross_validation([regions], [once], performed_groups([once]), split="repetitions")
 
 
-@pytest.mark.bench
-def test_cross_validated_accuracy(regions: RegionVideo, session: RecordedSession) -> None:
-    accuracy = cross_validation([regions], [session.labels], folds=3, split="repetitions")
-    assert set(accuracy) == {group.name for group in GROUPS}
-    assert sum(accuracy.values()) / len(accuracy) > 0.85  # the benchmark has five repetitions at 60 frames a second
-
-
 def test_planted_intensities_come_back(
     classifier: ActionUnitClassifier, regions: RegionVideo, session: RecordedSession
 ) -> None:
@@ -139,13 +132,6 @@ def test_planted_intensities_come_back(
     assert asked.active.any(0).nonzero()[:, 0].tolist() == sorted(
         names.index(f"noseSneer{s}") for s in ("Left", "Right")
     )
-
-
-@pytest.mark.bench
-def test_another_performer_is_understood(classifier: ActionUnitClassifier, other: RecordedSession) -> None:
-    video = read_regions(other.video, other.labels, classifier.regions, classifier.neutral, classifier.size)
-    found = level_agreement(classify(classifier, video), planted(other, classifier.units))
-    assert found["within_one"] > 0.8
 
 
 @dataclass

@@ -41,32 +41,22 @@ def error_with(rig: BlendshapeRig, sites: Attachment, take: Take, true: Tensor) 
     return float((solved.weights.values[..., 0] - true).abs().mean())
 
 
-def check_fit(performance: Performance, space: Similarity) -> None:
+def test_sites_on_the_performer_come_back(performance: Performance, stage_space: Similarity) -> None:
     rig, attachment, takes = performance
     performance = (rig, attachment, [takes[0][::10], takes[1][::10]])
     start = misplaced(rig, attachment, torch.Generator().manual_seed(1))
     assert float(site_distances(rig, start, attachment).min()) > 1.9
-    fit = fit_attachment(rig, filmed(performance, 0, space), start)
+    fit = fit_attachment(rig, filmed(performance, 0, stage_space), start)
     assert fit.attachment.labels == attachment.labels
     assert (site_distances(rig, fit.attachment, attachment) < 1.0).float().mean() >= 0.95
     assert float(fit.errors[-1].mean()) < 0.55  # 0.3 mm of noise a coordinate is 0.52
     assert fit.errors.shape[1] == len(attachment.triangles)
-    assert abs(float(fit.alignment.scale * space.scale) - 1) < 0.01
+    assert abs(float(fit.alignment.scale * stage_space.scale) - 1) < 0.01
     # Another take, the helmet put on anew.
-    again = Similarity(space.scale, space.rotation.transpose(1, 2), -space.translation)
+    again = Similarity(stage_space.scale, stage_space.rotation.transpose(1, 2), -stage_space.translation)
     take, true = filmed(performance, 1, again, 2), takes[1][::10]
     ours = error_with(rig, fit.attachment, take, true)
     assert ours <= 0.6 * error_with(rig, by_nearest_vertex(rig, start), take, true)
-
-
-def test_sites_on_the_performer_come_back(performance: Performance, stage_space: Similarity) -> None:
-    check_fit(performance, stage_space)
-
-
-@pytest.mark.bench
-@pytest.mark.real
-def test_sites_on_a_real_rig_come_back(real_capture: Performance, stage_space: Similarity) -> None:
-    check_fit(real_capture, stage_space)
 
 
 def test_markers_that_stand_off_the_skin(performance: Performance, stage_space: Similarity) -> None:
