@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
-from torchface.io.protocols.live_link_packets import LiveLinkPackets
+from torchface.io.protocols.live_link_packets import LiveLinkPackets, read_live_link
 from torchface.shape_names import ARKIT
 
 
@@ -21,6 +21,9 @@ def test_bytes_lie_where_other_receivers_look_for_them() -> None:
     assert struct.unpack_from("!if2ib", packet, 51) == (1, 0.0, 59940, 1000, 61)
     assert struct.unpack_from("!61f", packet, 68) == (*(i / 64 for i in range(52)), *(i / 8 for i in range(9)))
     assert len(packet) == 68 + 61 * 4
+    assert read_live_link(packet)[0].sent == pytest.approx(1 / 59.94)
+    later = packet[:51] + struct.pack("!if2i", 1200, 1.5, 30, 1) + packet[67:]
+    assert read_live_link(later)[0].sent == pytest.approx(1201.5 / 30)
 
 
 def test_what_no_packet_can_carry_is_refused() -> None:

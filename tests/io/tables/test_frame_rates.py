@@ -9,7 +9,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 
 from torchface.errors import FileFormatError
-from torchface.io.tables.frame_rates import FrameTimes, TimeSource, file_error, frame_times, key_times
+from torchface.io.tables.frame_rates import FrameTimes, TimeSource, file_error, frame_times, key_times, typical_rate
 
 
 def read(times: np.ndarray, numbers: np.ndarray | None = None, rate: float | None = None) -> FrameTimes:
@@ -55,6 +55,46 @@ def test_finer_units_are_recognised_and_said(scale: float, unit: str, fps: float
         found = frame_times(np.arange(100) / fps * scale, TimeSource(file_error("take.csv"), np.arange(100)))
     assert found.fps == pytest.approx(fps, rel=1e-5)
     assert found.seconds is None
+
+
+def of_frames(count: int, fps: float, jitter: float = 0.0, together: int = 1) -> np.ndarray:
+    """Times at which frames come that are delayed by up to some seconds, or delivered several at once."""
+    delays = np.random.default_rng(1).uniform(-jitter, jitter, count // together).repeat(together)
+    last = np.arange(count) // together * together + together - 1
+    return np.sort(last / fps + delays + 5e-4 * (np.arange(count) % together))
+
+
+@pytest.mark.parametrize("pause", [0.0, 5.0, 60.0])
+@pytest.mark.parametrize(
+    ("fps", "jitter", "together"),
+    [
+        *[(fps, 0.001, 1) for fps in (24000 / 1001, 24.0, 25.0, 30000 / 1001, 30.0, 50.0, 60000 / 1001, 60.0, 120.0)],
+        *[(60.0, 0.008, 1), (60.0, 0.03, 1), (30.0, 0.03, 1), (1.0, 0.03, 1)],
+        *[(60.0, 0.0, 2), (60.0, 0.0, 3), (60.0, 0.0, 4), (30.0, 0.0, 2), (60.0, 0.03, 4)],
+    ],
+)
+def test_a_rate_is_that_of_frames_while_they_come(fps: float, jitter: float, together: int, pause: float) -> None:
+    times = of_frames(1200, fps, jitter, together)
+    times[600:] += pause if fps > 1 else 10 * pause
+    found = read(times, np.arange(1200))
+    assert found.fps == pytest.approx(fps, rel=1e-9 if jitter == 0.001 else 0.01)
+    np.testing.assert_array_equal(found.seconds.numpy(), times)
+
+
+@pytest.mark.parametrize(
+    ("steps", "fps"),
+    [
+        ([1 / 60], 60.0),
+        ([1.0], 1.0),
+        ([1 / 60, 5.0], 60.0),
+        ([0.033, 0.034, 0.133, 0.034, 0.032], 4 / 0.133),
+        ([0.033, 0.05] * 50, 1 / 0.0415),  # no step of 40 ms among them
+        (([1 / 60] * 4 + [2 / 60]) * 60, 60.0),  # one in six was lost
+        ([1 / 30] * 200 + [1 / 15] * 50, 30.0),  # in the dark a camera takes half as many
+    ],
+)
+def test_the_typical_rate_of_few_or_uneven_steps(steps: list[float], fps: float) -> None:
+    assert typical_rate(np.array(steps)) == pytest.approx(fps)
 
 
 def test_a_long_gap_makes_no_milliseconds() -> None:

@@ -33,7 +33,7 @@ def test_uneven_frames_keep_their_times(dome: Path, tmp_path: Path) -> None:
         for i, came in enumerate(times):
             log.append(came, torch.full((52,), i / 8), torch.zeros(9))
         take = log.take(30.0)
-        assert take.fps == pytest.approx(5 / 0.42)
+        assert take.fps == pytest.approx(4 / 0.14)  # without the gap
         seconds = take.seconds
         np.testing.assert_allclose(seconds, times - 1000, atol=1e-9)
     recordings = Recordings(tmp_path / "out", load_character(dome), "planted", 30.0)
@@ -46,7 +46,11 @@ def test_uneven_frames_keep_their_times(dome: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose(table, times - 1000, atol=1e-6)
     keys = read_gltf_weights(tmp_path / "out" / "animation.glb").seconds
     np.testing.assert_allclose(keys, times - 1000, atol=1e-6)
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["even"] is False
+    read = [load_take(tmp_path / "out" / name).fps for name in ("weights.csv", "live_link.csv")]
+    read.append(read_gltf_weights(tmp_path / "out" / "animation.glb").fps)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert [*read, summary["fps"]] == pytest.approx([4 / 0.14] * 4, rel=1e-4)
+    assert summary["even"] is False
 
 
 def test_a_take_without_a_face_is_not_kept(dome: Path, tmp_path: Path) -> None:
@@ -64,9 +68,9 @@ def test_even_frames_make_an_even_take(tmp_path: Path) -> None:
     with FrameLog(tmp_path, ARKIT) as log:
         for i in range(50):
             log.append(12345.678 + i / 29.97, torch.zeros(52), torch.zeros(9))
-        take = log.take(1.0)
-        assert take.seconds is None
-        assert take.fps == 29.97
+        takes = [log.take(stated) for stated in (29.97, 1.0)]
+        assert [take.seconds for take in takes] == [None, None]
+        assert [take.fps for take in takes] == [29.97, 30000 / 1001]  # which Live Link Face's file gives
     assert list(tmp_path.iterdir()) == []
     with FrameLog(tmp_path, ARKIT) as log, pytest.raises(ValueRangeError, match="found no frame"):
         log.take(30.0)

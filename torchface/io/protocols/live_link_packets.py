@@ -1,5 +1,6 @@
 """Live Link Face's packets: frames of weights as the iPhone app sends them to Unreal."""
 
+import math
 import struct
 import uuid
 from collections.abc import Sequence
@@ -75,17 +76,18 @@ def read_live_link(packet: bytes) -> list[ReceivedFace]:
                 raise FileFormatError(f"packet: found a name of {length} bytes, expected at most {_MOST_TEXT}")
             texts.append(packet[at + 4 : at + 4 + length].decode(errors="replace"))
             at += 4 + length
-        number, _, _, _ = _TIME.unpack_from(packet, at)
+        number, part, rate, base = _TIME.unpack_from(packet, at)
+        sent = (number + part) * base / rate if rate else math.nan
         at += _TIME.size
         count = packet[at] if at < len(packet) else 0
         if count == 0:
-            return [ReceivedFace(torch.zeros(len(ARKIT)), subject=texts[1], number=number, found=False)]
+            return [ReceivedFace(torch.zeros(len(ARKIT)), subject=texts[1], number=number, found=False, sent=sent)]
         if count != _VALUES or len(packet) != at + 1 + _NUMBERS.size:
             raise FileFormatError(f"packet: found {count} values in {len(packet)} bytes, expected {_VALUES}")
         values = torch.tensor(_NUMBERS.unpack_from(packet, at + 1))
     except struct.error as error:
         raise FileFormatError(f"packet: found {len(packet)} bytes, expected a whole packet ({error})") from error
-    return [ReceivedFace(values[: len(ARKIT)], values[len(ARKIT) :], texts[1], number)]
+    return [ReceivedFace(values[: len(ARKIT)], values[len(ARKIT) :], texts[1], number, sent=sent)]
 
 
 def packet_rate(packet: bytes) -> float:

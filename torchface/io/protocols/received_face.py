@@ -22,6 +22,7 @@ class ReceivedFace:
     subject: str = ""  # how the sender calls the face or itself
     number: int | None = None  # of the frame as the sender counts; None where it does not
     found: bool = True  # whether the sender sees a face
+    sent: float = math.nan  # when, by the sender's clock in seconds, where it has one
 
     def __post_init__(self) -> None:
         for what, values, most in (("weight", self.weights, _MOST), ("rotation", self.rotations, _MOST_ANGLE)):

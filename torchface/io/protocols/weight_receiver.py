@@ -1,6 +1,7 @@
 """Receiver of faces by UDP: what an iPhone or another program sends, decoded, checked and put in order."""
 
 import errno
+import re
 import select
 import socket
 import time
@@ -30,6 +31,8 @@ _PORTS = 8  # of a sender that are remembered
 class PacketCounts:
     """What packets came."""
 
+    packets: int = 0  # of whatever kind
+    first: bytes = b""  # bytes of the last one
     taken: int = 0
     lost: int = 0
     late: int = 0  # those that came after a newer one
@@ -112,6 +115,7 @@ _LARGEST_PACKET = 65536
 _ASK_AGAIN = 2.0  # seconds without a packet after which the app is asked to send
 _MOST_SENDERS = 16
 _MOST_AT_ONCE = 256  # packets between two looks at the clock
+_FIRST = 32  # bytes by which a packet's kind is known
 
 
 class WeightReceiver:
@@ -153,7 +157,8 @@ class WeightReceiver:
             )
             raise ValueRangeError(f"stream: cannot receive at {address} ({why})") from error
         self._socket.setblocking(False)
-        self.port: int = self._socket.getsockname()[1]
+        host, self.port = self._socket.getsockname()[:2]
+        self.host = "" if host in ("0.0.0.0", "::") else str(host)  # of this machine's addresses; empty: all
 
     def faces(self, seconds: float) -> list[tuple[float, ReceivedFace]]:
         """The faces that have come, in order, and when; waits so many seconds for the first."""
@@ -180,6 +185,8 @@ class WeightReceiver:
 
     def _faces(self, packet: bytes, came: tuple[str, int], now: float) -> list[ReceivedFace]:
         host, port = came
+        self.counts.packets += 1
+        self.counts.first = packet[:_FIRST]
         try:
             faces = self._reader(host, port)(packet)
             if not self._order.knows_port:  # else one program may send each part of a face from another port
@@ -228,6 +235,19 @@ class WeightReceiver:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+
+def packet_kind(first: bytes) -> tuple[str, str]:
+    """What a packet looks like by its first bytes, for people, and the scheme that it is received with, if any."""
+    address = first[20:] if first.startswith(b"#bundle\0") else first
+    if address.startswith(b"/"):
+        return ("VMC", "vmc") if address.startswith(b"/VMC/") else ("OSC", "osc")
+    if first.startswith(b"\6\0\0\0"):
+        return "Live Link Face", "livelink"
+    text = first.decode("ascii", "replace")
+    if re.match(r"=?[A-Za-z_]+[-&#]-?[0-9]", text):
+        return "iFacialMocap", "ifacialmocap"
+    return (f"text ({text[:16]!r})" if text.isprintable() else f"bytes {first[:4].hex(' ')}"), ""
 
 
 def _readers(parts: StreamAddress) -> Callable[[], Read]:

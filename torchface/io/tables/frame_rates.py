@@ -30,6 +30,10 @@ _DIGITS = (1e-2, 1e-3, 1e-4, 1e-5, 1e-6)
 _BROADCAST = tuple(1000 * whole / 1001 for whole in (24, 30, 48, 60, 120))
 _SLOWEST = 3.0  # seconds from frame to frame: no film's, while milliseconds of 240 frames a second are beyond
 _UNITS = ("milliseconds", "microseconds", "nanoseconds")
+PAUSE = 8.0  # a step so many times the usual one is a pause
+_CLOSE, _EVENLY = 0.25, 0.6  # so near is a step to the middle one, and so many are it, where frames come one by one
+_GRID = 4.0  # times the typical rate; a grid of a higher one is not that of lost frames: some came at once
+_TOGETHER = 8  # frames that a network may deliver at once
 
 
 def simplest_rate(rate: float, agrees: Callable[[float], bool]) -> float:
@@ -44,6 +48,37 @@ def simplest_rate(rate: float, agrees: Callable[[float], bool]) -> float:
     usual = sorted(COMMON_RATES, key=lambda other: abs(other - rate))[:2]
     fractions = [float(Fraction(rate).limit_denominator(largest)) for largest in (1, 10, 1001)]
     return next((candidate for candidate in (*usual, *fractions) if candidate > 0 and agrees(candidate)), rate)
+
+
+def typical_rate(steps: np.ndarray) -> float:
+    """Frames a second while they come, by steps (T,), seconds, not all 0.
+
+    Pauses do not count. Lost frames do not where the others come one by one; where a network delays them, or
+    delivers several at once, all that came count.
+
+    Example:
+        >>> round(typical_rate(np.array([1 / 60] * 300 + [5.0] + [1 / 60] * 300)), 6)
+        60.0
+        >>> round(typical_rate(np.array([0.001, 0.039] * 100)), 6)
+        50.0
+    """
+    count, times = len(steps), np.concatenate([[0.0], np.cumsum(steps)])
+    window = min(_TOGETHER, count // 4) if count >= _TOGETHER else min(2, max(1, count - 1))
+    usual = _middle(times[window:] - times[:-window]) / window or float(steps.mean())
+    middle = _middle(steps)
+    near = np.abs(steps - middle) <= _CLOSE * middle
+    one_by_one = middle > usual / 2 and float(near.mean()) >= _EVENLY
+    return 1 / float(steps[near if one_by_one else steps <= PAUSE * usual].mean())
+
+
+def common_rate(rate: float) -> float:
+    """The common rate within 0.2 %, which a clock may have meant; else the rate as it is."""
+    common = min(COMMON_RATES, key=lambda other: abs(other - rate))
+    return common if abs(rate / common - 1) <= _NEAR else rate
+
+
+def _middle(values: np.ndarray) -> float:
+    return float(np.quantile(values, 0.5, method="lower"))
 
 
 @dataclass(frozen=True)
@@ -116,7 +151,7 @@ def frame_times(times: np.ndarray, source: TimeSource) -> FrameTimes:
     steps = np.diff(times)
     if source.rate is not None and np.abs(steps * source.rate - 1).min() <= _LIKE:
         return FrameTimes(source.rate, torch.from_numpy(times))
-    return FrameTimes(_checked(_rate(1.0, float(np.median(steps)), resolution, None), source), torch.from_numpy(times))
+    return FrameTimes(_checked(common_rate(typical_rate(steps)), source), torch.from_numpy(times))
 
 
 def key_times(times: np.ndarray, error: Callable[[str, str], FileFormatError]) -> FrameTimes:
@@ -174,11 +209,13 @@ def _resolution(times: np.ndarray) -> float:
 
 
 def _counted(times: np.ndarray) -> np.ndarray:
-    """Frame numbers (T,) that steps of the usual length give; they do not rise where times are no frames."""
+    """Frame numbers (T,) that steps of the usual length give; they do not rise where times are no frames'."""
     steps = np.diff(times)
-    usual = float(np.quantile(steps[steps > 0], 0.5, method="lower"))
-    near = steps[np.abs(steps - usual) < usual / 2]
-    return np.concatenate([[0.0], np.cumsum(np.rint(steps / near.mean()))])
+    usual = _middle(steps[steps > 0])
+    unit = float(steps[np.abs(steps - usual) < usual / 2].mean())
+    if 1 / unit > _GRID * typical_rate(steps):
+        return np.zeros(len(times))
+    return np.concatenate([[0.0], np.cumsum(np.rint(steps / unit))])
 
 
 def numbering_extras(numbers: np.ndarray, first: int, where: str) -> dict[str, Any]:

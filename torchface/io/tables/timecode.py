@@ -11,14 +11,13 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError
 from torchface.io.tables.csv_table import quoted
-from torchface.io.tables.frame_rates import COMMON_RATES, TimeSource, file_error, frame_times
+from torchface.io.tables.frame_rates import TimeSource, common_rate, file_error, frame_times, typical_rate
 from torchface.number_checks import check_rate
 
 _PATTERN = re.compile(r"([0-9]{1,2}):([0-9]{1,2}):([0-9]{1,2})([:;])([0-9]{1,3}(?:\.[0-9]{1,9})?)")
 _DAY = 24 * 3600
 _USUAL = 60
 _BASES = (24, 25, 30, 48, 50, 60, 72, 90, 96, 100, 120, 240)
-_TOLERANCE = 0.002  # 60 and 60000/1001 differ by 0.001
 
 
 @dataclass(frozen=True)
@@ -35,7 +34,7 @@ def read_timecodes(texts: Sequence[str], path: Path) -> Timing:
 
     ``FF`` counts frames of the timecode's base (60 for a 59.94 fps take), which is where it falls back to 0 as the
     seconds rise; a take without such a place has base 60 if it fits. ``;`` before ``FF`` marks drop-frame timecode.
-    The rate is the base over the mean step of the timecodes, gaps left out. Midnight is crossed.
+    The rate is the usual one of their steps (:func:`typical_rate`), gaps left out. Midnight is crossed.
     """
     seconds = np.empty(len(texts), np.int64)
     frames = np.empty(len(texts))
@@ -71,11 +70,8 @@ def read_timecodes(texts: Sequence[str], path: Path) -> Timing:
             f"{path}: found the timecode {texts[row + 1]} in frame {row + 2} after {texts[row]}, expected a clock that "
             "goes on: sort the rows by time, or cut the take there"
         )
-    typical = float(np.median(steps[steps > 0]))
-    step = float(steps[np.abs(steps - typical) < typical / 2].mean())
-    measured = rate_of_base / step
-    usual = min(COMMON_RATES, key=lambda rate: abs(rate - measured))
-    fps = check_rate(usual if abs(measured / usual - 1) <= _TOLERANCE else measured, f"{path}: timecodes")
+    measured = typical_rate(steps / rate_of_base)
+    fps = check_rate(common_rate(measured), f"{path}: timecodes")
     since = np.concatenate([[0.0], np.cumsum(steps)]) / rate_of_base
     source = TimeSource(file_error(path), rate=fps, resolution=_digits(texts) / rate_of_base, seconds=True)
     found = frame_times(since, source)

@@ -241,7 +241,8 @@ def go_live(
             raise ValueRangeError(f"{settings.camera}: found no frame, expected at least one")
         wrong = received.receiver.counts.words() if received is not None else ""
         more = (wrong, *(take.note for take in saved), *streams.notes())
-        return LiveReport(session.figures, source.dropped, tuple(note for note in more if note)), saved
+        silence = "" if received is None else received.silence
+        return LiveReport(session.figures, source.dropped, tuple(note for note in more if note), silence), saved
 
 
 def _keep_dropped(preparing: Preparing, recordings: Recordings, say: Say) -> None:

@@ -5,7 +5,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from torchface.io.tables.frame_rates import common_rate, typical_rate
+
 _LEAST, _MOST, _STEP = 0.05, 60_000.0, 1.01  # milliseconds; what is reported is within 1 %
+_RECENT = 2**12  # steps from frame to frame by which the rate is measured
 _BINS = math.ceil(math.log(_MOST / _LEAST) / math.log(_STEP))
 
 
@@ -15,12 +18,17 @@ class LiveFigures:
     def __init__(self) -> None:
         self.frames = self.found = 0
         self._histogram = np.zeros(_BINS + 1, np.int64)
+        self._steps, self._fresh = np.zeros(_RECENT), 0
         self._first = self._last = self._came = 0.0
 
-    def add(self, came: float, gone: float, seen: bool) -> None:
-        """Counts a frame that came and was sent on at these times, in seconds."""
+    def add(self, came: float, gone: float, seen: bool, fresh: bool = True) -> None:
+        """Counts a frame that came and was sent on at these times, in seconds; ``fresh`` where somebody sent it."""
         self._first = self._first if self.frames else came
-        self._last, self._came = gone, came
+        self._last = gone
+        if fresh:
+            self._steps[(self._fresh - 1) % _RECENT] = came - self._came  # the first one's is replaced
+            self._came = came
+            self._fresh += 1
         self.frames += 1
         self.found += seen
         latency = 1000 * (gone - came)
@@ -41,8 +49,9 @@ class LiveFigures:
 
     @property
     def fps(self) -> float:
-        """Frames a second, from the first one's arrival to the last one's; 0 before the second."""
-        return (self.frames - 1) / max(self._came - self._first, 1e-9) if self.frames > 1 else 0.0
+        """Frames a second while they come, as a recording has them; 0 before the second."""
+        steps = self._steps[: max(0, self._fresh - 1)]
+        return common_rate(typical_rate(steps)) if steps.any() else 0.0
 
 
 @dataclass(frozen=True)
@@ -52,10 +61,14 @@ class LiveReport:
     figures: LiveFigures
     dropped: int  # frames that came while another was solved
     notes: tuple[str, ...] = ()  # what the user should know, such as receivers that were not there
+    silence: str = ""  # that no face has come, where an address was listened at
 
     def lines(self) -> list[str]:
         """For people to read."""
         figures = self.figures
+        warnings = [f"warning: {note}" for note in self.notes]
+        if self.silence:
+            return [f"in {figures.seconds:.1f} s {self.silence}", *warnings]
         none = figures.frames > 0 and figures.found == 0
         return [
             f"{figures.frames} frames solved in {figures.seconds:.1f} s, a face in {figures.found}; they came at "
@@ -63,5 +76,5 @@ class LiveReport:
             f"{figures.latency(0.5):.1f} ms from frame to packet (99th percentile {figures.latency(0.99):.1f} ms), "
             f"{self.dropped} frames were dropped, as they came while another was solved",
             *(["warning: no face was found, so nothing has moved: weights and head stayed at rest"] if none else []),
-            *(f"warning: {note}" for note in self.notes),
+            *warnings,
         ]

@@ -1,5 +1,6 @@
 """Frames in real time, from a camera or a video played at its own rate, and what is solved of each."""
 
+import math
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -141,6 +142,8 @@ class LiveFrame:
     gaze: Tensor = field(default_factory=lambda: torch.zeros(2, 2))
     calibrated: float = 1.0  # how far the person is learned, in [0,1]
     found: bool = False  # whether a face is there, where no landmarks say so
+    fresh: bool = True  # whether somebody sent it; else it is what is shown while nobody does
+    sent: float = math.nan  # when, by the sender's clock in seconds, where it has one
     # the picture with what was solved drawn over it, uint8 (H,W,3); the page shows it in the picture's place
     drawn: np.ndarray | None = None
     # how many other people stand to the left of the face in the picture, and to the right, smoothed, (2,)

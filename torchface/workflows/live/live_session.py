@@ -223,7 +223,7 @@ class LiveSession:
                 self._streams.send(wanted.weights, wanted.rotations)
                 now = time.perf_counter()
                 given = came + self._source.late
-                self.figures.add(given, now, solved.seen)
+                self.figures.add(given, now, solved.seen, solved.fresh)
                 interval = 0.0 if before is None else came - before
                 with self._changed:
                     shown = picture if solved.drawn is None else solved.drawn

@@ -4,6 +4,8 @@ import math
 import socket
 import time
 from collections.abc import Iterator
+from contextlib import suppress
+from ipaddress import ip_address
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +15,7 @@ from torch import Tensor
 from torchface.capture.anybody import WebcamControls
 from torchface.capture.curve_calibration import CurveCalibration
 from torchface.io.protocols.received_face import ReceivedFace
-from torchface.io.protocols.weight_receiver import WeightReceiver
+from torchface.io.protocols.weight_receiver import WeightReceiver, packet_kind
 from torchface.io.video import VideoFile
 from torchface.shape_names import ARKIT
 from torchface.temporal.one_euro import OneEuroSettings, one_euro_step
@@ -25,6 +27,7 @@ _FPS = 60.0  # of phones, where times do not say
 _SIZE = (480, 360)
 _SILENT, _TICK, _WAIT = 0.1, 1 / 30, 0.2  # seconds without a packet: until the first tick, between ticks, at rest
 _HOLD, _RELAX, _RESTS = 0.5, 0.4, 4.0  # seconds: the last face is held, falls to 1/e, is at rest
+_PATIENCE = 5.0  # seconds without a face until it is said what may be wrong
 _NO_ROUTE = "192.0.2.1"  # an address for documentation: nothing is sent to it
 _CUTOFF, _SPREAD, _SPEED = 9.0, 9.0, 10.0  # Hz without smoothing, by how much less with all, and for each unit a second
 
@@ -59,6 +62,33 @@ class ReceivedSource:
                 self.fresh = False
                 wait = _TICK if now - self.heard < _RESTS else _WAIT
                 yield now, self._picture
+
+    @property
+    def place(self) -> str:
+        """Where it listens and what to type into the app, in words."""
+        receiver = self.receiver
+        at = f"port {receiver.port} (UDP)" + (f" of {receiver.host}" if receiver.host else "")
+        if receiver.asks:
+            return f"{at}: {receiver.address} is asked to send; open iFacialMocap there"
+        if receiver.host and ip_address(receiver.host).is_loopback:
+            return (
+                f"{at}, which only this machine reaches; for a phone, start with {receiver.scheme}://:{receiver.port}"
+            )
+        return f"{at}: have the app send to {receiver.host or own_address()}"
+
+    @property
+    def silence(self) -> str:
+        """What to say where no face has come; empty where one has."""
+        receiver, counts = self.receiver, self.receiver.counts
+        if self.face is not None:
+            return ""
+        if counts.packets:
+            kind, scheme = packet_kind(counts.first)
+            other = f"; {scheme}://:{receiver.port} receives those" if scheme not in ("", receiver.scheme) else ""
+            return f"no face has come, but packets ({counts.packets}) that look like {kind}{other}"
+        others = [] if receiver.host or receiver.asks else other_addresses()
+        more = f" (or to {', '.join(others)}, whichever is in its network)" if others else ""
+        return f"no packet has come to {self.place}{more}. A firewall on this machine may hold packets back"
 
     def close(self) -> None:
         """Gives the port back."""
@@ -109,6 +139,8 @@ class ReceivedSolver:
             gaze=-torch.stack([rotations[6:8], rotations[3:5]]),
             calibrated=self._calibration.learned,
             found=ever and self._lost <= _HOLD,
+            fresh=self._source.fresh,
+            sent=math.nan if face is None else face.sent,
         )
 
     def _smoothed(self, values: Tensor, interval: float, smoothing: float) -> Tensor:
@@ -126,14 +158,21 @@ class ReceivedWatch:
     def __init__(self, source: ReceivedSource, say: Say) -> None:
         self._source, self._say = source, say
         self._state = ""
-        self.words = self._waiting()
+        self._began: float | None = None
+        self._waiting, self._silence = f"Waiting for a face at {source.place}", ""
+        self.words = self._waiting
         say(self.words)
 
     def look(self, picture: np.ndarray, solved: LiveFrame, now: float) -> None:
         """Updates ``words`` after a frame."""
         source, counts = self._source, self._source.receiver.counts
         if source.face is None:
-            state, words = counts.fault, self._waiting()
+            self._began = now if self._began is None else self._began
+            late = now - self._began >= _PATIENCE
+            if late and (counts.packets or not self._silence):  # to look addresses up may take a second
+                self._silence = f"For {_PATIENCE:g} seconds {source.silence}"
+            words = self._silence if late else self._waiting
+            state = counts.fault + (f" after {_PATIENCE:g} s {packet_kind(counts.first)}" if late else "")
         elif source.fresh and not source.face.found:
             state = words = f"{source.receiver.sender}: connected, but sees no face: the last expression is held"
         elif source.fresh or now - source.heard < _HOLD:
@@ -147,12 +186,6 @@ class ReceivedWatch:
             self._state = state
             self._say(self.words)
 
-    def _waiting(self) -> str:
-        receiver = self._source.receiver
-        if receiver.address.startswith("ifacialmocap://") and receiver.asks:
-            return f"Waiting for a face: {receiver.address} is asked to send; open iFacialMocap there"
-        return f"Waiting for a face at port {receiver.port}: have the app send to {own_address()}"
-
 
 def own_address() -> str:
     """This machine's address in its network; its name where it has none."""
@@ -162,3 +195,11 @@ def own_address() -> str:
             return str(probe.getsockname()[0])
         except OSError:
             return socket.gethostname()
+
+
+def other_addresses() -> list[str]:
+    """What else this machine's name stands for, such as its address in a second network."""
+    with suppress(OSError):
+        found = {str(info[4][0]) for info in socket.getaddrinfo(socket.gethostname(), None, socket.AF_INET)}
+        return sorted(one for one in found - {own_address()} if not ip_address(one).is_loopback)
+    return []

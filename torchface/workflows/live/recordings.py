@@ -1,6 +1,7 @@
 """Takes performed live and kept: frames logged as they come, then weights, Live Link Face CSV, animation, summary."""
 
 import json
+import math
 import os
 import shutil
 import signal
@@ -28,9 +29,9 @@ from torchface.workflows.browser_app.character import Character
 from torchface.workflows.live.kept_takes import ANIMATION, LIVE_LINK, SUMMARY, WEIGHTS, printable
 from torchface.workflows.live.live_frames import LiveFrame, Say
 from torchface.workflows.live.take_film import FILM, TakeFilm
+from torchface.workflows.live.take_times import take_times
 
 _LOG = "frames"
-_EVEN = 1e-6  # seconds by which times that are even may be off
 _LOOK = 128  # frames between looks at how full the disk is
 _RESERVE, _NUMBER_BYTES = (
     2**26,
@@ -47,9 +48,11 @@ class FrameLog:
 
     def __init__(self, folder: Path, names: tuple[str, ...], columns: int | None = None) -> None:
         self.names, self.count = names, 0
+        self.came = 0  # of these, how many somebody sent
         self._columns = _columns(names) if columns is None else columns
         numbers = (len(names),), (len(ROTATIONS),)
-        self._row = np.dtype([("weights", "<f4", *numbers[:1]), ("rotations", "<f4", *numbers[1:]), ("time", "<f8")])
+        times = ("time", "<f8"), ("sent", "<f8"), ("fresh", "<i4")  # all of a size that PyTorch can step by
+        self._row = np.dtype([("weights", "<f4", *numbers[:1]), ("rotations", "<f4", *numbers[1:]), *times])
         self._first = 0.0
         try:
             handle, self._path = new_temporary(folder / _LOG)
@@ -57,19 +60,23 @@ class FrameLog:
             raise unwritten(folder, error) from error
         self._file = os.fdopen(handle, "r+b", buffering=2**18)
 
-    def append(self, came: float, weights: Tensor, rotations: Tensor) -> None:
-        """Adds a frame: when it came in seconds of any clock, weights (N,), rotations (9,)."""
+    def append(
+        self, came: float, weights: Tensor, rotations: Tensor, fresh: bool = True, sent: float = math.nan
+    ) -> None:
+        """Adds a frame: when it came in seconds of any clock, weights (N,), rotations (9,), and of what is received
+        ``LiveFrame``'s fields."""
         if self.count % _LOOK == 0:
             self._check_room()
         if self.count == 0:
             self._first = came
         row = np.zeros(1, self._row)
         row["weights"], row["rotations"] = weights.detach().cpu().numpy(), rotations.detach().cpu().numpy()
-        row["time"] = came - self._first
+        row["time"], row["sent"], row["fresh"] = came - self._first, sent, fresh
         try:
             self._file.write(row.tobytes())
         except OSError as error:
             raise unwritten(self._path, error) from error
+        self.came += fresh
         self.count += 1  # last: of a frame at which an interrupt came in between nothing is read
 
     def _check_room(self) -> None:
@@ -82,7 +89,14 @@ class FrameLog:
                 )
 
     def take(self, fps: float) -> Take:
-        """The frames, as they lie on the disk: valid until the log is closed; ``fps`` is a single frame's."""
+        """The frames, as they lie on the disk: valid until the log is closed.
+
+        Times and rate are those that a reader of any of its files finds. Frames of a time when nobody sent are left
+        out; of a pause a few are kept, so that nothing moves towards what comes after it.
+
+        Args:
+            fps: the source's stated rate, which a take has whose times say nothing.
+        """
         if self.count == 0:
             raise ValueRangeError("recording: found no frame, expected at least one")
         try:
@@ -90,15 +104,11 @@ class FrameLog:
         except OSError as error:
             raise unwritten(self._path, error) from error
         rows = np.memmap(self._path, self._row, "c", shape=(self.count,))
-        seconds = torch.from_numpy(rows["time"].copy())
+        kept, fps, seconds = take_times(rows["time"], rows["fresh"] > 0, rows["sent"], fps)
+        rows = rows if len(kept) == self.count else rows[kept]
         angles = torch.from_numpy(rows["rotations"].astype(np.float64))
         columns = {name: angles[:, i].clone() for i, name in enumerate(ROTATIONS)}
         track = Track(self.names, torch.from_numpy(rows["weights"])[..., None])
-        if self.count > 1:
-            fps = (self.count - 1) / float(seconds[-1])
-            even = torch.arange(self.count).double() / round(fps, 3)
-            if float((even - seconds).abs().max()) <= _EVEN:
-                return Take(round(fps, 3), weights=track, extras={"columns": columns})
         return Take(fps, weights=track, extras={"columns": columns}, seconds=seconds)
 
     def close(self) -> None:
@@ -155,8 +165,8 @@ class Recordings:
 
     @property
     def frames(self) -> int:
-        """How many frames the take that runs has."""
-        return self._log.count if self._log is not None else 0
+        """How many frames of the take that runs have come."""
+        return self._log.came if self._log is not None else 0
 
     @property
     def folder(self) -> Path:
@@ -198,8 +208,8 @@ class Recordings:
             return
         if self._log.count == 0:
             self._began = came
-        self._log.append(came, frame.weights, frame.rotations)
-        self._found += frame.seen
+        self._log.append(came, frame.weights, frame.rotations, frame.fresh, frame.sent)
+        self._found += frame.seen and frame.fresh
         if self._film is not None and picture is not None:
             self._film.add(came, picture)
 
@@ -239,18 +249,22 @@ class Recordings:
                 if film is not None:  # before the summary, by which a take is listed
                     film.close()
                 if log.count and found == 0:
-                    raise ValueRangeError(f"found a face in none of its {log.count} frames, expected one")
-                missing = self._write(log, folder, found) if log.count else ""
+                    none = f"found a face in none of its {log.came} frames" if log.came else "received no face"
+                    raise ValueRangeError(f"{none}, expected one")
+                frames, missing = self._write(log, folder, found) if log.count else (0, "")
                 problems = [one for one in (missing, film.problem if film is not None else "") if one]
-                self.saved.append(SavedTake(folder, log.count, note="; ".join(problems)))
+                self.saved.append(SavedTake(folder, frames, note="; ".join(problems)))
             except (TorchfaceError, OSError) as error:
-                self.saved.append(SavedTake(folder, log.count, str(error)))
+                self.saved.append(SavedTake(folder, log.came, str(error)))
         if say is not None:
             done = self.saved[-1]
-            say(done.error or f"recorded into {folder}: {log.count} frames" + (f"; {done.note}" if done.note else ""))
+            say(done.error or f"recorded into {folder}: {done.frames} frames" + (f"; {done.note}" if done.note else ""))
 
-    def _write(self, log: FrameLog, folder: Path, found: int, more: Mapping[str, str] = MappingProxyType({})) -> str:
-        """Makes a take's files; why its animation is missing, where the others alone could be written."""
+    def _write(
+        self, log: FrameLog, folder: Path, found: int, more: Mapping[str, str] = MappingProxyType({})
+    ) -> tuple[int, str]:
+        """Makes a take's files: how many frames they have, and why its animation is missing, where the others alone
+        could be written."""
         take = log.take(self._fps)
         assert take.weights is not None
         driven = self._character.weights(take.weights.values[..., 0])
@@ -282,7 +296,7 @@ class Recordings:
                 if ANIMATION not in files:
                     raise
                 missing = f"without {ANIMATION}: {error}"
-        return missing
+        return len(take), missing
 
 
 @contextmanager
