@@ -41,6 +41,11 @@ def test_dropped_frames_are_on_the_grid_exactly(steps: list[int], fps: float) ->
             torch.testing.assert_close(found.seconds, expected, atol=1e-9, rtol=0)
 
 
+@given(st.lists(st.sampled_from([0.0, 1e-9, 1e-3, 1 / 60, 1.0, 1e6]), min_size=1, max_size=40).filter(any))
+def test_any_steps_have_a_rate(steps: list[float]) -> None:
+    assert 1 / max(steps) <= typical_rate(np.array(steps)) * (1 + 1e-9) < float("inf")
+
+
 @given(st.integers(0, 2**32 - 1))
 def test_times_of_a_variable_rate_are_kept(seed: int) -> None:
     times = np.cumsum(np.random.default_rng(seed).uniform(0.2, 3, 50)) / 30
@@ -90,6 +95,7 @@ def test_a_rate_is_that_of_frames_while_they_come(fps: float, jitter: float, tog
         ([0.033, 0.034, 0.133, 0.034, 0.032], 4 / 0.133),
         ([0.033, 0.05] * 50, 1 / 0.0415),  # no step of 40 ms among them
         (([1 / 60] * 4 + [2 / 60]) * 60, 60.0),  # one in six was lost
+        ([5e-4, 2 / 60 - 5e-4, 2 / 60, 2 / 60, 2 / 60] * 60, 5 / (8 / 60)),  # pairs of which many lost one
         ([1 / 30] * 200 + [1 / 15] * 50, 30.0),  # in the dark a camera takes half as many
     ],
 )

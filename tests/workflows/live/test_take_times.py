@@ -141,7 +141,7 @@ def test_a_senders_clock_is_kept_and_not_the_networks_delays(delays: np.ndarray)
 def test_a_clock_that_does_not_go_as_this_machines_is_not_used(sent: np.ndarray, came: np.ndarray) -> None:
     fps, seconds = the_times(sent, came)
     assert fps == 60.0
-    np.testing.assert_allclose(seconds, came - came[0], atol=1e-9)
+    np.testing.assert_allclose(seconds, came - came[0], atol=1e-5)  # of timecodes
 
 
 @pytest.mark.parametrize("came", [[0.0], [0.0] * 5, [0.0, 1e-6, 2e-6], [0.0, 300.0], [0.0, 0.1, 0.1, 0.05, 0.2]])

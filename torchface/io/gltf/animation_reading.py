@@ -15,6 +15,7 @@ from torchface.io.gltf.corrective_extras import scene_correctives
 from torchface.io.gltf.gltf_document import Document, read_document, shown
 from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.tables.frame_rates import FrameTimes, key_times
+from torchface.number_checks import MAX_FPS, MIN_FPS
 from torchface.take import Take, Track
 
 _LINEAR, _STEP, _CUBIC = "LINEAR", "STEP", "CUBICSPLINE"
@@ -96,7 +97,8 @@ def read_gltf_weights(path: str | Path) -> Take | None:
     location = f"animations[{first}]"
     if times is None or not any(set(moving.names) - followers for moving in curves):
         return None
-    frames = key_times(times, lambda found, expected: document.error(location, found, expected))
+    stated = _stated_rate(document.objects("animations")[first or 0])
+    frames = key_times(times, lambda found, expected: document.error(location, found, expected), stated)
     if any(moving.way != _LINEAR for moving in curves) and np.diff(times).max(initial=0) > _FILM_STEP:
         keys = times.astype(np.float64) - float(times[0])
         rate = next((one for one in _FILM_RATES if _meets(keys * one)), _FILM_RATES[-1])
@@ -133,6 +135,14 @@ def _weight_channels(
         if target.get("path") == "weights":
             node = document.item("nodes", target.get("node"), f"{location}.target.node")
             yield location, channel, document.integer(node, "mesh", f"{location}.target.node")
+
+
+def _stated_rate(animation: dict[str, Any]) -> float | None:
+    """What torchface has written beside the keys."""
+    extras = animation.get("extras")
+    ours = extras.get("torchface") if isinstance(extras, dict) else None
+    fps = ours.get("fps") if isinstance(ours, dict) else None
+    return float(fps) if isinstance(fps, int | float) and MIN_FPS <= fps <= MAX_FPS else None
 
 
 def _shown_name(animation: dict[str, Any], which: int) -> str:

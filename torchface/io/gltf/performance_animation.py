@@ -29,6 +29,7 @@ class Performance:
     weights: NDArray[np.float32]  # (T,N)
     # Live Link Face's yaw, pitch and roll of head, left and right eye, (T,9) radians; the head keeps its pose without
     rotations: NDArray[np.float64] | None = None
+    fps: float | None = None  # kept beside the keys, whose times are rounded
 
 
 def performed_glb(document: Document, performance: Performance) -> bytes:
@@ -59,7 +60,9 @@ def performed_glb(document: Document, performance: Performance) -> bytes:
     for node_index, turned in turns:
         quaternions = np.ascontiguousarray(turned.as_quat(), np.float32)
         drive(node_index, "rotation", buffers.keys(quaternions))
-    animation = {"name": "performance", "samplers": samplers, "channels": channels}
+    animation: dict[str, Any] = {"name": "performance", "samplers": samplers, "channels": channels}
+    if performance.fps is not None:
+        animation["extras"] = {"torchface": {"fps": performance.fps}}
     root["animations"] = [animation, *root.get("animations", [])]  # programs that play one take the first
     return b"".join(glb_pieces(root, buffers, document.path))
 

@@ -31,7 +31,9 @@ _BROADCAST = tuple(1000 * whole / 1001 for whole in (24, 30, 48, 60, 120))
 _SLOWEST = 3.0  # seconds from frame to frame: no film's, while milliseconds of 240 frames a second are beyond
 _UNITS = ("milliseconds", "microseconds", "nanoseconds")
 PAUSE = 8.0  # a step so many times the usual one is a pause
-_CLOSE, _EVENLY = 0.25, 0.6  # so near is a step to the middle one, and so many are it, where frames come one by one
+_CLOSE, _EVENLY = 0.25, 0.59  # so near is a step to the middle one, and so many are it, where frames come one by one
+_ROUNDS = 3  # of averaging what is near the middle step; that one alone is rounded differently by each file
+_MISSED = 2.5  # steps of so many frames may be of lost ones
 _GRID = 4.0  # times the typical rate; a grid of a higher one is not that of lost frames: some came at once
 _TOGETHER = 8  # frames that a network may deliver at once
 
@@ -66,9 +68,21 @@ def typical_rate(steps: np.ndarray) -> float:
     window = min(_TOGETHER, count // 4) if count >= _TOGETHER else min(2, max(1, count - 1))
     usual = _middle(times[window:] - times[:-window]) / window or float(steps.mean())
     middle = _middle(steps)
-    near = np.abs(steps - middle) <= _CLOSE * middle
-    one_by_one = middle > usual / 2 and float(near.mean()) >= _EVENLY
-    return 1 / float(steps[near if one_by_one else steps <= PAUSE * usual].mean())
+    for _ in range(_ROUNDS if middle > 0 else 0):
+        near = _up_to(_CLOSE * middle, np.abs(steps - middle))
+        middle = float((near @ steps) / near.sum())
+    one_by_one = usual / 2 < middle < usual * (1 + _CLOSE) and near.mean() >= _EVENLY
+    # How many frames each step is of, gradually from one number to the next: files round times differently.
+    whole, part = np.divmod(steps / middle, 1) if one_by_one else (np.ones(count), 0.0)
+    frames = whole + np.clip((part - 0.35) / 0.3, 0, 1)
+    counted = _up_to(_MISSED * middle if one_by_one else PAUSE * usual, steps)
+    lasting = float(counted @ steps)
+    return float(counted @ frames) / lasting if lasting > 0 else count / float(steps.sum())
+
+
+def _up_to(limit: float, values: np.ndarray) -> np.ndarray:
+    """Weights (T,): 1 up to the limit, then less, and 0 from 1.2 of it on."""
+    return np.clip(6 - 5 * values / limit, 0, 1)
 
 
 def common_rate(rate: float) -> float:
@@ -154,11 +168,12 @@ def frame_times(times: np.ndarray, source: TimeSource) -> FrameTimes:
     return FrameTimes(_checked(common_rate(typical_rate(steps)), source), torch.from_numpy(times))
 
 
-def key_times(times: np.ndarray, error: Callable[[str, str], FileFormatError]) -> FrameTimes:
-    """When the keys of an animation at ``times`` (T,), seconds in single precision, are shown, from 0."""
+def key_times(times: np.ndarray, error: Callable[[str, str], FileFormatError], rate: float | None = None) -> FrameTimes:
+    """When the keys of an animation at ``times`` (T,), seconds in single precision, are shown, from 0; ``rate`` is the
+    stated one."""
     times = times.astype(np.float64) - float(times[0])
     resolution = 2 * float(np.spacing(np.float32(times[-1])))
-    return frame_times(times, TimeSource(error, resolution=resolution, seconds=True))
+    return frame_times(times, TimeSource(error, rate=rate, resolution=resolution, seconds=True))
 
 
 def _checked(rate: float, source: TimeSource) -> float:

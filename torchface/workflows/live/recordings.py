@@ -281,7 +281,7 @@ class Recordings:
         }
         names, targets = self._character.targets(driven)
         turns = np.stack([take.extras["columns"][name].numpy() for name in ROTATIONS], 1)
-        performance = Performance(take.times.numpy(), names, targets.numpy(), turns)
+        performance = Performance(take.times.numpy(), names, targets.numpy(), turns, take.fps)
         animation, missing = performed_glb(self._character.document, performance), ""
         for files in ([WEIGHTS, LIVE_LINK, ANIMATION], [WEIGHTS, LIVE_LINK]):
             try:

@@ -7,6 +7,7 @@ from torchface.io.tables.frame_rates import PAUSE, TimeSource, common_rate, file
 from torchface.number_checks import MAX_FPS, MIN_FPS
 
 _LEAST = 5e-4  # seconds between frames: what all files of a take keep, those in single precision up to two hours
+_TICK = 1 / 60_000  # seconds, which timecodes count
 _SPACED, _SLOWEST = 1.25 * PAUSE, 5.0  # steps, but not more seconds, between frames kept of a time when nobody sends
 _RELAXED = 4.0  # seconds in which nobody sends, and after which nothing moves
 _OFF, _SHARE, _DRIFT = 0.1, 0.25, 2e-4  # of clocks: seconds, but not more of a take; seconds a second
@@ -39,12 +40,12 @@ def take_times(
         return came, stated, None
     rate = typical_rate(np.diff(_rising(times[came])))
     kept = _with_pauses(times, fresh, min(_SPACED / rate, _SLOWEST))
-    times = _rising(times[kept])
+    times = np.rint(_rising(times[kept]) / _TICK) * _TICK
     rate = typical_rate(np.diff(times))
     if not MIN_FPS <= rate <= MAX_FPS:
         return came, stated, None
     rate = stated if abs(rate / stated - 1) <= _OWN_RATE else common_rate(rate)
-    found = frame_times(times, TimeSource(file_error("recording"), rate=rate, resolution=0.0, seconds=True))
+    found = frame_times(times, TimeSource(file_error("recording"), rate=rate, resolution=_TICK, seconds=True))
     return kept, found.fps, found.seconds
 
 
