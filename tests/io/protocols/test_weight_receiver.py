@@ -288,3 +288,10 @@ def test_senders_that_do_not_count_are_taken_as_they_come() -> None:
     order = FrameOrder()
     assert all(took(order, [None] * 5))
     assert order.counts.words() == ""
+
+
+def test_addresses_of_osc_that_move_nothing_are_counted_and_named() -> None:
+    addresses = [f"/avatar/parameters/v2/Tongue{axis}" for axis in "XY"]
+    with WeightReceiver("osc://127.0.0.1:0") as receiver:
+        played(receiver, [osc_message(address, 0.5) for address in (*addresses, *addresses, "/face/jawOpen")])
+        assert receiver.counts.words() == f"2 addresses that move no shape ({', '.join(addresses)})"

@@ -1,7 +1,7 @@
 """VRChat's OSC: avatar parameters by Unified Expressions (v2) and by ARKit's names, and its own eye tracking."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
@@ -10,6 +10,7 @@ from torchface.errors import ShapeError
 from torchface.io.protocols.live_link_packets import ArkitWeights, rotations_sent
 from torchface.io.protocols.osc_messages import LARGEST_IN_ETHERNET, osc_bundles, osc_message
 from torchface.io.protocols.osc_packets import names_for_osc
+from torchface.io.protocols.unified_parameters import ACTIVE, COMBINED, FULL_GAZE, LARGER
 from torchface.shape_names import ARKIT, UNIFIED
 
 VRCHAT_PORT = 9000
@@ -18,69 +19,6 @@ VRCHAT_NAMINGS = ("unified", "arkit", "eyes", "own")
 """What is sent: ``v2/`` parameters, ARKit's 52, VRChat's eye tracking, or the weights as they are called."""
 
 _PARAMETERS = "/avatar/parameters/"
-_SIDES = ("Left", "Right")
-_FULL_GAZE = math.radians(45.0)  # what VRCFaceTracking counts as 1
-
-_MEANS = (
-    *("BrowInnerUp", "BrowOuterUp", "CheekSquint", "EyeClosed", "LipFunnel", "LipFunnelLower", "LipFunnelUpper"),
-    *("LipPucker", "LipPuckerLower", "LipPuckerUpper", "LipSuckLower", "LipSuckUpper", "MouthDimple"),
-    *("MouthLowerDown", "MouthPress", "MouthStretch", "MouthUpperUp", "NoseSneer"),
-)
-"""Parameters that are the mean of all expressions whose names begin so and end in parts and sides."""
-
-_PARTS = ("", "Upper", "Lower")
-
-
-def _combined() -> dict[str, dict[str, float]]:
-    """Parameters that are sums of several expressions; ``1`` is a constant."""
-    sums: dict[str, dict[str, float]] = {
-        "JawX": {"JawRight": 1, "JawLeft": -1},
-        "JawZ": {"JawForward": 1},
-        "MouthUpperX": {"MouthUpperRight": 1, "MouthUpperLeft": -1},
-        "MouthLowerX": {"MouthLowerRight": 1, "MouthLowerLeft": -1},
-        "MouthX": {"MouthUpperRight": 0.5, "MouthLowerRight": 0.5, "MouthUpperLeft": -0.5, "MouthLowerLeft": -0.5},
-    }
-    for stem in _MEANS:
-        terms = [f"{stem}{part}{side}" for part in _PARTS for side in _SIDES]
-        terms = [term for term in terms if term in UNIFIED.names]
-        sums[stem] = {term: 1 / len(terms) for term in terms}
-    for side in _SIDES:
-        smile = {f"MouthCornerPull{side}": 0.8, f"MouthCornerSlant{side}": 0.2}
-        lower = {f"BrowLowerer{side}": 0.75, f"BrowPinch{side}": 0.25}
-        sums |= {
-            f"EyeOpen{side}": {"1": 1, f"EyeClosed{side}": -1},
-            f"EyeLid{side}": {"1": 0.75, f"EyeClosed{side}": -0.75, f"EyeWide{side}": 0.25},
-            f"BrowUp{side}": {f"BrowOuterUp{side}": 0.6, f"BrowInnerUp{side}": 0.4},
-            f"BrowDown{side}": lower,
-            f"BrowExpression{side}": {f"BrowInnerUp{side}": 0.5, f"BrowOuterUp{side}": 0.5}
-            | {name: -share for name, share in lower.items()},
-            f"CheekPuffSuck{side}": {f"CheekPuff{side}": 1},
-            f"MouthSmile{side}": smile,
-            f"SmileFrown{side}": smile | {f"MouthFrown{side}": -1},
-            f"SmileSad{side}": smile | {f"MouthFrown{side}": -1},
-        }
-    for stem in (
-        "EyeOpen",
-        "EyeLid",
-        "BrowUp",
-        "BrowDown",
-        "BrowExpression",
-        "CheekPuffSuck",
-        "SmileFrown",
-        "SmileSad",
-    ):
-        both = [sums[stem + side] for side in _SIDES]
-        sums[stem] = {name: sum(terms.get(name, 0.0) for terms in both) / 2 for name in {**both[0], **both[1]}}
-    lips = ("MouthUpperUpLeft", "MouthUpperUpRight", "MouthLowerDownLeft", "MouthLowerDownRight")
-    sums["MouthOpen"] = dict.fromkeys(lips, 0.25)
-    return sums
-
-
-COMBINED: Mapping[str, Mapping[str, float]] = _combined()
-"""Source: docs.vrcft.io, VRCFaceTracking Parameters. ``SmileSad`` counts the frown alone."""
-
-_ACTIVE = ("EyeTrackingActive", "ExpressionTrackingActive", "LipTrackingActive")
-_LARGER = {"EyeWide": ("EyeWideLeft", "EyeWideRight"), "EyeSquint": ("EyeSquintLeft", "EyeSquintRight")}
 
 
 class VrchatPackets:
@@ -123,15 +61,15 @@ class VrchatPackets:
             if "eyes" in self._namings:
                 eyes = _eye_tracking(arkit, turned)
         messages = [osc_message(_PARAMETERS + name, value) for name, value in parameters.items()]
-        messages += [osc_message(_PARAMETERS + name, True) for name in _ACTIVE]
+        messages += [osc_message(_PARAMETERS + name, True) for name in ACTIVE]
         return osc_bundles([*messages, *eyes], LARGEST_IN_ETHERNET)
 
     def _unified(self, arkit: Tensor, rotations: Tensor) -> dict[str, float]:
         unified = UNIFIED.from_arkit(arkit)
         values = dict(zip(self._sent, unified[self._rows].tolist(), strict=True))
         values |= dict(zip(COMBINED, (self._sums @ unified + self._constant).tolist(), strict=True))
-        values |= {name: max(values[left], values[right]) for name, (left, right) in _LARGER.items()}
-        _, _, _, left_yaw, left_pitch, _, right_yaw, right_pitch, _ = (rotations / _FULL_GAZE).clamp(-1, 1).tolist()
+        values |= {name: max(values[left], values[right]) for name, (left, right) in LARGER.items()}
+        _, _, _, left_yaw, left_pitch, _, right_yaw, right_pitch, _ = (rotations / FULL_GAZE).clamp(-1, 1).tolist()
         gaze = {"EyeLeftX": left_yaw, "EyeLeftY": -left_pitch, "EyeRightX": right_yaw, "EyeRightY": -right_pitch}
         return values | gaze | {"EyeX": (left_yaw + right_yaw) / 2, "EyeY": -(left_pitch + right_pitch) / 2}
 

@@ -8,10 +8,11 @@ import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 from torchface.errors import TorchfaceError, ValueRangeError
+from torchface.escaped_text import visible
 from torchface.io.protocols.ifacialmocap_packets import START, read_ifacialmocap
 from torchface.io.protocols.live_link_packets import read_live_link
 from torchface.io.protocols.osc_packets import OscReader
@@ -25,6 +26,7 @@ _QUICKEST = 240  # frames a second that a clock counts on while its app sends no
 _RECENT = 30
 _FREE = 2.0  # seconds after which another sender may take over
 _PORTS = 8  # of a sender that are remembered
+_NAMED = 5  # addresses
 
 
 @dataclass
@@ -40,13 +42,21 @@ class PacketCounts:
     jumps: int = 0  # how often the sender's count was set
     malformed: int = 0  # packets that are none of the protocol
     fault: str = ""  # what is wrong with the last of these
+    unused: dict[str, None] = field(default_factory=dict)  # addresses of OSC that move nothing, in their order
 
     def words(self) -> str:
         """What went wrong, for people; empty if nothing did."""
         names = {"lost": "lost", "late": "late", "others": "of another sender"}
         names["jumps"] = "jump of its clock" if self.jumps == 1 else "jumps of its clock"
         found = [f"{getattr(self, name)} {words}" for name, words in names.items() if getattr(self, name)]
-        return ", ".join([*found, *([f"{self.malformed} not understood ({self.fault})"] if self.malformed else [])])
+        if self.malformed:
+            found.append(f"{self.malformed} not understood ({self.fault})")
+        if self.unused:
+            some = [visible(address) for address in list(self.unused)[:_NAMED]]
+            more = ", ..." if len(self.unused) > _NAMED else ""
+            what = "1 address that moves" if len(self.unused) == 1 else f"{len(self.unused)} addresses that move"
+            found.append(f"{what} no shape ({', '.join(some)}{more})")
+        return ", ".join(found)
 
 
 class FrameOrder:
@@ -131,9 +141,9 @@ class WeightReceiver:
         parts = parse_source(address)
         self.scheme = parts.scheme
         self._read: dict[tuple[str, int], Read] = {}
-        self._make = _readers(parts)
         self._order = FrameOrder()
         self.counts = self._order.counts
+        self._make = _readers(parts, self.counts.unused)
         self._phone, self._asked, self._heard = None, float("-inf"), float("-inf")
         if parts.scheme == "ifacialmocap" and parts.host:
             family, self._phone = resolved(parts, address)
@@ -250,11 +260,11 @@ def packet_kind(first: bytes) -> tuple[str, str]:
     return (f"text ({text[:16]!r})" if text.isprintable() else f"bytes {first[:4].hex(' ')}"), ""
 
 
-def _readers(parts: StreamAddress) -> Callable[[], Read]:
+def _readers(parts: StreamAddress, unused: dict[str, None]) -> Callable[[], Read]:
     if parts.scheme == "vmc":
         return VmcReader
     if parts.scheme == "osc":
-        return lambda: OscReader(parts.path)
+        return lambda: OscReader(parts.path, unused)
     read = read_live_link if parts.scheme == "livelink" else read_ifacialmocap
     return lambda: read
 

@@ -182,6 +182,7 @@ class ReceivedWatch:
             words = f"{state} ({now - source.heard:.0f} s)"
         wrong = counts.words()
         self.words = f"{words} · {wrong}" if wrong else words
+        state += " and more" if counts.unused else ""  # addresses that move nothing are named once
         if state != self._state:
             self._state = state
             self._say(self.words)
