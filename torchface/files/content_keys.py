@@ -16,16 +16,13 @@ _BLOCK = 2**22
 
 
 def content_key(method: str, **inputs: object) -> str:
-    """Differs where the method, this package's version or the content of any input does.
+    """Sixty-four hex digits, others where the method, this package's version or the content of any input differs.
 
     Args:
         method: its name and a number that is raised whenever the same inputs come to give other results.
         inputs: everything the results depend on: tensors, texts, numbers, dataclasses and modules of these, mappings
             and sequences. A ``Path`` stands for what lies there: a file's bytes, a folder's files with their names,
             those that are hidden left out; nothing that can be read is a content of its own.
-
-    Returns:
-        Sixty-four hex digits.
     """
     digest = hashlib.sha256()
     for part in (method, __version__, inputs):

@@ -42,15 +42,12 @@ class ModelRecord:
 def write_model(
     model: nn.Module, folder: str | Path, record: ModelRecord, card: str = "", half: Collection[str] = ()
 ) -> ModelRecord:
-    """Writes a model into a folder; its files take their places together, ``model.toml`` last.
+    """Writes a model into a folder, its files at once, ``model.toml`` last; the record as written.
 
     Args:
         record: kind, licence, data, metrics, recipe; size, hash and config are filled in.
         card: Markdown for ``CARD.md``: what the model is good for, measured how, its limits.
         half: names in the state that are stored in half precision.
-
-    Returns:
-        The record as written.
     """
     odd = [name for name, value in record.metrics.items() if not math.isfinite(value)]
     if odd:

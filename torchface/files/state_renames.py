@@ -27,13 +27,10 @@ CONFIG_RENAMES: Mapping[str, Mapping[str, str]] = {"action_units": {"beside": "o
 
 
 def current_state_keys(kind: str, stored: Collection[str], expected: Collection[str]) -> dict[str, str]:
-    """What the keys of a stored state are called now.
+    """What the keys of a stored state are called now: a name for each of ``stored``, all different.
 
     A key is renamed only where the module lacks it, has the new one, and the state does not hold that one besides;
     what is left over is for the reader to refuse.
-
-    Returns:
-        A name for each of ``stored``, all different.
     """
     names = {key: key for key in stored}
     for key in stored:

@@ -189,7 +189,7 @@ class SimplexSolution(torch.autograd.Function):
 
 
 def attach_gradients(gradient: Callable[[Tensor], Tensor], solution: Tensor, free: Tensor) -> Tensor:
-    r"""A solution that was found without gradients, as a differentiable function of what the problem is made of.
+    r"""A solution (B,D) that was found without gradients, as a differentiable function of what the problem is made of.
 
     Free variables satisfy :math:`g(x, \theta)_F = 0`, the others stay at their bounds, so
     :math:`dx_F = -(\partial g / \partial x)_{FF}^{-1} (\partial g / \partial \theta)_F \, d\theta`: one Newton step
@@ -199,9 +199,6 @@ def attach_gradients(gradient: Callable[[Tensor], Tensor], solution: Tensor, fre
         gradient: g, of (B,D) to (B,D), each row of its own; built of differentiable operations on :math:`\theta`.
         solution: (B,D).
         free: variables inside their bounds, (B,D) bool.
-
-    Returns:
-        The solution, (B,D).
 
     Source: the implicit function theorem; Amos and Kolter 2017 for bounds.
     """

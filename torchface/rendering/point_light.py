@@ -87,7 +87,7 @@ class PointLight:
 
 
 def irradiance(points: Tensor, normals: Tensor, light: PointLight, lit: Tensor | None = None) -> Tensor:
-    r"""What a light brings to points of a surface, by which the albedo is multiplied; linear, differentiable.
+    r"""What a light brings to points of a surface, by which the albedo is multiplied; linear, differentiable, (...,3).
 
     .. math:: I_v = I_a + I_p\, \max(0, N_v \cdot L_v)
 
@@ -95,9 +95,6 @@ def irradiance(points: Tensor, normals: Tensor, light: PointLight, lit: Tensor |
         points: in the camera's frame, (...,3), millimetres.
         normals: unit, (...,3).
         lit: the share of the source that each point sees, (...,); all if absent.
-
-    Returns:
-        Linear light of red, green, blue, (...,3).
 
     Source: thesis 4.2.11, equation 66.
     """

@@ -163,9 +163,6 @@ def relight(
         beyond: relight what lies beside the outline too, as what is within: a filmed face never ends exactly where
             its mesh does. Mask what is no skin afterwards.
 
-    Returns:
-        A frame of the same kind.
-
     Source: thesis 4.2.11 and figure 80.
     """
     image = _checked(frame, mesh.vertices, mesh, camera)

@@ -136,13 +136,10 @@ def with_eyes(take: Take, rig: BlendshapeRig) -> Take:
 def write_weights(
     take: Take, files: WeightFiles, rig: BlendshapeRig, source: Path | None = None
 ) -> tuple[list[str], list[str]]:
-    """Writes a take's weights, and says what a file leaves out and how many keys it has.
+    """Writes a take's weights; warnings of what a file leaves out, and lines of how many keys it has.
 
     ``files.out`` is Live Link Face's CSV where it gives every shape back, because all are ARKit's; else
     ``frame,time,<shape>,...`` with every shape by its own name.
-
-    Returns:
-        Warnings, and other lines for people to read.
     """
     assert take.weights is not None
     lost, few = not_in_live_link(take.weights.names), take

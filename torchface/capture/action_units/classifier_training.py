@@ -206,7 +206,7 @@ def check_training(
 
 
 def intensity_levels(images: Tensor, at_rest: Tensor, levels: int = 4, seed: int = 0) -> Tensor:
-    """The level of each frame of one action, 0 for rest.
+    """The level of each frame of one action, (T,) int64 from 0, which is rest, to ``levels - 1``.
 
     The first principal component gives one number a frame; k-means clusters these into ``levels``, which are
     ordered by how far they lie from the frames at rest.
@@ -214,9 +214,6 @@ def intensity_levels(images: Tensor, at_rest: Tensor, levels: int = 4, seed: int
     Args:
         images: one region, or several side by side, in every repetition of the action, (T,...).
         at_rest: frames just before and after a repetition, (T,) bool.
-
-    Returns:
-        (T,) int64 from 0 to ``levels - 1``.
 
     Source: thesis 4.1.11.
     """

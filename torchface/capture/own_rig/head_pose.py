@@ -35,14 +35,11 @@ class HeadPoses:
 
 
 def measure_poses(points: Tensor, landmarks: Tensor, intrinsics: Tensor, confidence: Tensor | None = None) -> HeadPoses:
-    """The pose of each frame by itself.
+    """The pose of each frame by itself; frames with fewer than six stable landmarks that agree are not found.
 
     Args:
         points: the 68 landmarks on the rig at rest, (68,3), millimetres.
         landmarks: (T,68,2), pixels, NaN for not seen; undistorted.
-
-    Returns:
-        ``HeadPoses``. Frames with fewer than six stable landmarks that agree are not found.
 
     Source: thesis 4.2.4.
     """

@@ -25,7 +25,7 @@ _HALVES = 3  # marked patches that keep a cluster on the midline from being join
 def motion_clusters(
     motion: Numbers, centres: Numbers, pairs: Ids, count: int, midline: float, apart: Ids, seed: int = 0
 ) -> Ids:
-    """Clusters of patches by correlated motion.
+    """The cluster of each patch by correlated motion, (P,), from 0 to ``count`` - 1.
 
     Spectral clustering: patches are alike as their motion correlates and as they are near along the surface; the
     graph's eigenvectors are joined to clusters by Ward's rule along the patches' adjacency, which keeps every cluster
@@ -36,9 +36,6 @@ def motion_clusters(
         motion: how far each patch is from its mean place or shape in every frame, (K,P,C).
         midline: the plane of symmetry is x = ``midline``.
         apart: patches, such as those of the mouth, whose clusters stay two halves.
-
-    Returns:
-        The cluster of each patch, (P,), from 0 to ``count`` - 1.
 
     Source: Tena, De la Torre, Matthews 2011, Interactive region-based linear 3D face models, section 3.
     """

@@ -26,7 +26,7 @@ class Pose:
 def solve_pnp(
     points: Tensor, pixels: Tensor, intrinsics: Tensor, weights: Tensor | None = None, initial: Pose | None = None
 ) -> Pose:
-    r"""The poses in which a camera sees points where they are seen, with least squared error.
+    r"""The poses in which a camera sees points where they are seen, with least squared error; float64.
 
     .. math:: \min_{R,t} \sum_i w_i \lVert \pi(K (R x_i + t)) - q_i \rVert^2, \quad R \in SO(3)
 
@@ -39,9 +39,6 @@ def solve_pnp(
         intrinsics: K, (B,3,3) or (3,3).
         weights: non-negative, (B,N) or (N,); equal if absent.
         initial: poses to refine; found from nothing if absent.
-
-    Returns:
-        ``Pose(rotation (B,3,3), translation (B,3), errors (B,))`` in float64.
 
     Source: thesis 3.2.5, equation 12; DeMenthon and Davis 1995.
     """

@@ -23,14 +23,11 @@ def is_landmark_header(header: Sequence[str]) -> bool:
 
 
 def load_landmarks_csv(path: str | Path) -> Take:
-    """Reads 2D landmarks as OpenFace writes them.
+    """Reads 2D landmarks as OpenFace writes them, (T,L,2) pixels, float32, with the frame's confidence for each.
 
     A landmark ``n`` is the columns ``x_n`` and ``y_n``; a frame of ``success`` 0 was not seen: NaN. Every other column
     (gaze, pose, 3D points, action units) is in ``extras["columns"]`` by name, (T,) float64. Frame numbers other than
     1, 2, ... are kept in ``extras["frame_numbers"]``; frames that come unevenly keep their times.
-
-    Returns:
-        landmarks (T,L,2) in pixels, float32, with the frame's confidence for each.
 
     Source: OpenFace wiki, "Output Format".
     """

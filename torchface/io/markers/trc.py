@@ -20,7 +20,7 @@ _FIELDS = ("DataRate", "CameraRate", "NumFrames", "NumMarkers", "Units", "OrigDa
 
 
 def load_trc(path: str | Path, unit: str | None = None) -> Take:
-    """Reads a TRC file; a marker whose cells are empty or NaN was not seen.
+    """Reads a TRC file, in millimetres, float32; a marker whose cells are empty or NaN was not seen.
 
     Empty and repeated labels are made distinct (:func:`torchface.io.markers.marker_checks.unique_labels`). Frame
     numbers other than 1, 2, ... are kept in ``extras["frame_numbers"]``; frames that come unevenly keep their times.
@@ -28,9 +28,6 @@ def load_trc(path: str | Path, unit: str | None = None) -> Take:
     Args:
         path: the file, y up as OpenSim has it.
         unit: ``"mm"``, ``"cm"``, ``"m"`` or ``"in"``; else what the header's ``Units`` says.
-
-    Returns:
-        markers in millimetres, float32.
 
     Source: OpenSim documentation, "Marker (.trc) Files".
     """

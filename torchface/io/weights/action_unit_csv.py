@@ -23,12 +23,9 @@ def is_action_unit_header(header: Sequence[str]) -> bool:
 
 
 def load_action_units(path: str | Path) -> Take:
-    """Reads intensities (``AU01_r``), 0 to 5, as weights 0 to 1; presences (``AU01_c``) are no weights.
+    """Reads intensities (``AU01_r``), 0 to 5, as weights 0 to 1, by OpenFace's names; presences (``AU01_c``) are none.
 
     A frame of ``success`` 0 showed no face: NaN.
-
-    Returns:
-        weights (T,N,1), float32, by OpenFace's names.
 
     Source: OpenFace wiki, "Output Format".
     """

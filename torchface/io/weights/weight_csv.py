@@ -19,15 +19,12 @@ _TIMECODE = "timecode"
 
 
 def load_weights_csv(path: str | Path) -> Take:
-    """Reads weights from CSV with the header ``frame,time,<shape>,...``.
+    """Reads weights, float32, from CSV with the header ``frame,time,<shape>,...``; names stay as the file spells them.
 
     One row a frame; times in seconds; an empty cell is NaN. The rate is that of numbers and times; frames that come
     unevenly keep their times. Numbers other than 0, 1, ... go to ``extras["frame_numbers"]``. A column ``timecode`` and
     head and eye rotations by Live Link Face's names (``HeadYaw``, ...) are no shapes: they go to ``timecode`` and to
     ``extras["columns"]``, where :func:`torchface.io.weights.live_link_csv.load_live_link` has them.
-
-    Returns:
-        weights (T,N,1), float32, names as the file spells them.
     """
     path = Path(path)
     reader = TableReader(path)

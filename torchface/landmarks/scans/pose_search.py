@@ -68,7 +68,7 @@ class NoseCandidates:
 
 
 def protrusion(points: Tensor, normals: Tensor, queries: Tensor) -> tuple[Tensor, Tensor]:
-    r"""How far each query stands out over its surroundings, and the mean normal near it.
+    r"""How far each query stands out over its surroundings, (Q,) millimetres, and the unit mean normal near it, (Q,3).
 
     With the mean normal n of the surface within 9 mm of q, what is measured is the mean of
     :math:`n \cdot (q - p)` over the surface points p between 9 and 26 mm away: nearly 0 on a cheek, 3 mm on a ball of
@@ -77,9 +77,6 @@ def protrusion(points: Tensor, normals: Tensor, queries: Tensor) -> tuple[Tensor
     Args:
         points, normals: the surface, (N,3).
         queries: (Q,3).
-
-    Returns:
-        Heights (Q,) in millimetres and unit directions (Q,3).
     """
     tree, looked = cKDTree(points.numpy()), cKDTree(queries.numpy())
     pairs = looked.sparse_distance_matrix(tree, _FAR, output_type="ndarray")

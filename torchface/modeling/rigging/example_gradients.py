@@ -7,7 +7,7 @@ _NUMBERS_AT_ONCE = 2**23
 
 
 def shape_stiffness(changes: Tensor, kappa: float, theta: float) -> Tensor:
-    r"""How firmly each triangle of a shape holds to the prior: much where the template hardly deforms.
+    r"""How firmly each triangle of a shape holds to the prior, (N,F): much where the template hardly deforms.
 
     .. math:: w_i = \left(\frac{1 + \lVert G_i - I \rVert_F}{\kappa + \lVert G_i - I \rVert_F}\right)^\theta
 
@@ -16,9 +16,6 @@ def shape_stiffness(changes: Tensor, kappa: float, theta: float) -> Tensor:
         kappa: where stiffness levels off; :math:`\kappa^{-\theta}` is the highest.
         theta: how steeply it falls, to 1 where a triangle deforms strongly.
 
-    Returns:
-        (N,F).
-
     Source: thesis 3.3.3, below equation 28; Li, Weise and Pauly 2010.
     """
     size = changes.flatten(2).norm(dim=-1)
@@ -26,7 +23,7 @@ def shape_stiffness(changes: Tensor, kappa: float, theta: float) -> Tensor:
 
 
 def example_shares(residuals: Tensor, weights: Tensor, compliance: Tensor) -> Tensor:
-    r"""What each example adds, element by element, once what shapes share among them is taken out.
+    r"""What each example adds, X (M,F,K), once what shapes share among them is taken out.
 
     .. math:: \min_D \sum_j \lVert R_j - \sum_i \alpha_{ji} D_i \rVert^2 + \sum_i c_i^{-1} \lVert D_i \rVert^2
 
@@ -37,9 +34,6 @@ def example_shares(residuals: Tensor, weights: Tensor, compliance: Tensor) -> Te
         residuals: R, what the prior leaves of each example, (M,F,K).
         weights: A, :math:`\alpha`, (M,N).
         compliance: :math:`c = 1 / (\beta w)`, (N,F); a shape that an element may not change in has 0 there.
-
-    Returns:
-        X, (M,F,K).
 
     Source: thesis 3.3.3, equations 27 and 28.
     """
@@ -57,14 +51,11 @@ def example_shares(residuals: Tensor, weights: Tensor, compliance: Tensor) -> Te
 
 
 def personal_part(shares: Tensor, weights: Tensor, compliance: Tensor) -> Tensor:
-    r"""What some of the shapes take up, :math:`D_i = c_i \sum_j \alpha_{ji} X_j`.
+    r"""What some of the shapes take up, :math:`D_i = c_i \sum_j \alpha_{ji} X_j`, (G,F,K).
 
     Args:
         shares: X, (M,F,K).
         weights: of these shapes in the examples, (M,G).
         compliance: of these shapes, (G,F).
-
-    Returns:
-        D, (G,F,K).
     """
     return compliance[..., None] * torch.einsum("mg,mfk->gfk", weights, shares)

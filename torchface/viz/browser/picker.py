@@ -202,7 +202,7 @@ def _beside(template: Tensor, scan: Tensor) -> Tensor:
 
 
 def save_picks(session: PickSession, folder: str | Path, rig: BlendshapeRig | None = None) -> list[Path]:
-    """Writes everything that is picked.
+    """Writes everything that is picked, and says into which files.
 
     ==================== =======================================================================================
     landmarks.json       landmark vertices, :func:`torchface.io.landmarks.picks.load_landmarks`
@@ -210,9 +210,6 @@ def save_picks(session: PickSession, folder: str | Path, rig: BlendshapeRig | No
     attachment.json      marker sites, ``Attachment.load``
     correspondences.json pairs of template and scan, :func:`torchface.io.landmarks.picks.load_correspondences`
     ==================== =======================================================================================
-
-    Returns:
-        The files written.
     """
     folder, picks = Path(folder), session.picks
     picked = [vertex for vertex in picks.landmarks if vertex is not None]

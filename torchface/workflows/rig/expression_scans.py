@@ -165,7 +165,7 @@ def check_side(actor: BlendshapeRig, weights: Tensor, found: Tensor, seen: Tenso
 def seen_example(
     found: Mesh, expected: Tensor, seen: Tensor, data_weight: float = _DATA_WEIGHT, damping: float = _DAMPING
 ) -> Tensor:
-    r"""The expression of a scan without what the scan has not shown.
+    r"""The expression of a scan without what the scan has not shown, vertices (V,3), in the dtype of ``expected``.
 
     .. math:: \min_y \; \tau \sum_{v \in seen} \lVert y_v - (x_v - e_v) \rVert^2
         + \sum_{(v, w)} \lVert y_v - y_w \rVert^2 + \varphi \sum_v \lVert y_v \rVert^2, \quad \text{result } e + y
@@ -180,9 +180,6 @@ def seen_example(
         seen: vertices that the scans show, (V,) bool.
         data_weight: :math:`\tau`.
         damping: :math:`\varphi`.
-
-    Returns:
-        vertices (V,3), in the dtype of ``expected``.
     """
     count = len(found.vertices)
     if expected.shape != (count, 3) or seen.shape != (count,):

@@ -114,11 +114,7 @@ def fit_warnings(fit: FitCheck, aligned: bool, slip: bool) -> list[str]:
 def check_head(
     rig: BlendshapeRig, attachment: Attachment, take: Take, insist: bool = False, cause: str = ""
 ) -> list[str]:
-    """Whether rig, attachment and take belong to one head.
-
-    Returns:
-        Warnings where the residual of the take is that of another head.
-    """
+    """Warnings where rig, attachment and take do not belong to one head, by the residual of the take."""
     warnings = []
     distance = attachment.rest_distance(rig.neutral)
     if distance > MAX_REST_DISTANCE:

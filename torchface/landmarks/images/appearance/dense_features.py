@@ -20,7 +20,7 @@ _BELL = [math.exp(-(step**2) / (2 * _CELL**2)) for step in range(-4, 5)]
 
 
 def dense_features(images: Tensor, kind: Features) -> Tensor:
-    r"""Features of every pixel.
+    r"""Features of every pixel, (B,C,H,W), C as in ``CHANNELS``.
 
     ``grey``
         grey values less the mean of their neighbourhood, in units of its deviation.
@@ -31,9 +31,6 @@ def dense_features(images: Tensor, kind: Features) -> Tensor:
 
     Args:
         images: grey, (B,1,H,W) in [0,1].
-
-    Returns:
-        (B,C,H,W), C as in ``CHANNELS``.
 
     Source: Tzimiropoulos, Zafeiriou, Pantic 2012 (directions); Lowe 2004, Antonakos et al. 2015 (histograms).
     """

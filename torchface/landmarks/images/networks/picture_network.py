@@ -26,7 +26,7 @@ class PictureNetwork(nn.Module):
         device: str | torch.device = "cpu",
         log: ValueLog | None = None,
     ) -> Self:
-        """Trains a network on pictures.
+        """Trains a network on pictures; the running mean of its weights, in evaluation mode, on the CPU.
 
         Args:
             pictures: indexed by numbers (B,), such as a ``TensorDataset``; each batch is asked for by a
@@ -34,9 +34,6 @@ class PictureNetwork(nn.Module):
             checkpoint: a file that is kept while it runs, and taken up by the next run with the same settings; more
                 pictures may have come by then.
             log: called with what was measured, every fifty steps.
-
-        Returns:
-            The running mean of the weights, in evaluation mode, on the CPU.
         """
         settings = settings or cls._usual_settings()
         network = network or cls.drawn(settings.seed)
