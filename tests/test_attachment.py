@@ -9,9 +9,8 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from torchface.attachment import Attachment
-from torchface.errors import FileFormatError, NameMismatchError, TopologyError, TorchfaceError
-from torchface.mesh import Mesh
+from torchface import Attachment, Mesh, TorchfaceError
+from torchface.errors import FileFormatError, NameMismatchError, TopologyError
 from torchface.synthetic import performer
 
 

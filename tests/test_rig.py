@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 import torch
 
+from torchface import BlendshapeRig, Mesh
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
-from torchface.mesh import Mesh
-from torchface.rig import BlendshapeRig
 
 
 def small_rig(seed: int = 0) -> BlendshapeRig:

@@ -13,8 +13,7 @@ import torch
 from torch import Tensor
 
 from planted.expression_sequences import expression_sequences
-from torchface.io import load_rig, load_take
-from torchface.rig import BlendshapeRig
+from torchface import BlendshapeRig, load_rig, load_take
 from torchface.shape_names import mapping
 from torchface.synthetic.stages.wrinkles import WrinkledPerformer
 

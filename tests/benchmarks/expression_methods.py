@@ -12,16 +12,15 @@ import torch
 from torch import Tensor
 
 from planted.mediapipe_tracker import MediaPipeTracker
+from torchface import BlendshapeRig, Take, Track, load_take, save_rig
 from torchface.capture import ExampleSolver, WebcamControls
 from torchface.capture.anybody import AllAtOnce, character_matrix, paper_examples
-from torchface.io import load_ict_facekit, load_take, save_live_link, save_rig
+from torchface.io import load_ict_facekit, save_live_link
 from torchface.io.video import open_video
 from torchface.landmarks.images.face_mesh_478 import landmarks_of_mesh
 from torchface.progress import silent
-from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import performer
-from torchface.take import Take, Track
 from torchface.workflows.live.live_anybody import person_solver
 from torchface.workflows.track.track_inputs import TrackSettings
 from torchface.workflows.track.track_video import track_video

@@ -16,9 +16,8 @@ import torch
 from character_trials import Trial, rigged, trial
 
 from planted.characters import UPRIGHT, Planted, caricature, decimated, other_topology, without
+from torchface import BlendshapeRig, load_rig
 from torchface.geometry.rotations import rotation_matrix
-from torchface.io import load_rig
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 
 SECONDS, FINDING = 60.0, 10.0  # on two quiet cores

@@ -27,12 +27,11 @@ from enhancement_comparison import (
 from enhancement_scenes import FPS
 from torch import Tensor
 
-from torchface.attachment import Attachment
+from torchface import Attachment, BlendshapeRig
 from torchface.capture import MarkerSolver, VideoSolver
 from torchface.enhancement.thin_shell import ThinShell
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.meshes.surface_index import SurfaceIndex
-from torchface.rig import BlendshapeRig
 
 pytestmark = [pytest.mark.real, pytest.mark.usefixtures("one_thread")]
 EACH = 3  # test frames of which one is enhanced: 10 a second

@@ -18,16 +18,14 @@ import torch
 from torch import Tensor
 
 from planted.asked_expressions import EXAMPLES
+from torchface import BlendshapeRig, Mesh, load_take
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.io import load_take
-from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
-from torchface.mesh import Mesh
-from torchface.modeling.rigging.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
+from torchface.io import load_ict_facekit, load_identity_modes
+from torchface.modeling import ExampleRig, RiggingSchedule, rig_from_examples
 from torchface.optim import box_qp
-from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.weight_curves import perform
+from torchface.synthetic.stages import perform
 
 GUESSED = RiggingSchedule(gamma=(25.0, 25.0))
 

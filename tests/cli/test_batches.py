@@ -10,12 +10,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchface.attachment import Attachment
+from torchface import Attachment, BlendshapeRig, Take, Track, save_rig, save_take
 from torchface.cli import main
-from torchface.io import save_rig, save_take
-from torchface.rig import BlendshapeRig
-from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
-from torchface.take import Take, Track
+from torchface.synthetic.stages import StageFlaws, place_markers, record
 from torchface.workflows.evaluate.evaluation_record import Evaluation
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")

@@ -8,12 +8,10 @@ import pytest
 import torch
 from PIL import Image
 
-from torchface import zoo
+from torchface import BlendshapeRig, Mesh, load_mesh, save_mesh, save_rig, zoo
 from torchface.cli import main
-from torchface.io import Correspondences, load_mesh, save_correspondences, save_mesh, save_rig
-from torchface.mesh import Mesh
+from torchface.io import Correspondences, save_correspondences
 from torchface.modeling import MorphableModel
-from torchface.rig import BlendshapeRig
 
 pytestmark = pytest.mark.usefixtures("coarse_figures")
 

@@ -11,16 +11,14 @@ import torch
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from torchface import zoo
+from torchface import BlendshapeRig, save_rig, save_take, zoo
 from torchface.capture import ShapePrior
 from torchface.cli import main
 from torchface.cli.terminal import PlainConsole, plain_errors, print_path
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import check_writable, make_folder
-from torchface.io import save_rig, save_take
 from torchface.rendering.compositing import from_figure
-from torchface.rig import BlendshapeRig
-from torchface.synthetic.stages.marker_stage import place_markers, record
+from torchface.synthetic.stages import place_markers, record
 
 
 @pytest.fixture(scope="module")

@@ -7,13 +7,11 @@ import pytest
 import torch
 from reading_here import same_process  # noqa: F401
 
+from torchface import Annotations, BlendshapeRig, Take, Track, load_rig, save_animation, save_mesh
 from torchface.cli import main
 from torchface.errors import ValueRangeError
-from torchface.io import load_animation, load_rig, save_animation, save_mesh
-from torchface.mesh import Annotations
-from torchface.registration.landmark_files import load_scan_landmarks
-from torchface.rig import BlendshapeRig
-from torchface.take import Take, Track
+from torchface.io import load_animation
+from torchface.registration import load_scan_landmarks
 from torchface.workflows.animated_meshes import load_animated
 from torchface.workflows.batch.batch_items import SCAN_ENDINGS
 from torchface.workflows.posed_mesh import load_posed

@@ -4,11 +4,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.correctives import Corrective, Correctives
+from torchface import BlendshapeRig, Corrective, Correctives, Mesh, TorchfaceError
 from torchface.correctives.activation import CorrectiveActivation
-from torchface.errors import NameMismatchError, ShapeError, TorchfaceError, ValueRangeError
-from torchface.mesh import Mesh
-from torchface.rig import BlendshapeRig
+from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 
 SHAPES = ("a", "b", "c", "d")
 DEFINITIONS = (

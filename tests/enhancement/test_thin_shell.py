@@ -7,7 +7,7 @@ from scipy import sparse
 from scipy.sparse.linalg import spsolve
 from scipy.spatial import Delaunay
 
-from torchface.attachment import Attachment
+from torchface import Attachment, Mesh
 from torchface.enhancement import thin_shell
 from torchface.enhancement.coarse_level import coarse_level
 from torchface.enhancement.thin_shell import ThinShell, rigid_motion
@@ -15,7 +15,6 @@ from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.operators import border_vertices
 from torchface.geometry.meshes.shell_energies import bending_energy, stretching_energy
 from torchface.geometry.rotations import rotation_matrix
-from torchface.mesh import Mesh
 
 
 def sheet(bulge: float, count: int = 400, hole: bool = True) -> tuple[torch.Tensor, torch.Tensor]:

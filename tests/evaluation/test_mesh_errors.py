@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from torchface.attachment import Attachment
+from torchface import Attachment, BlendshapeRig, Mesh
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.evaluation import (
     error_figures,
@@ -17,8 +17,6 @@ from torchface.evaluation import (
     weight_error,
 )
 from torchface.geometry.rotations import rotation_matrix
-from torchface.mesh import Mesh
-from torchface.rig import BlendshapeRig
 
 
 def random_rig(seed: int) -> BlendshapeRig:

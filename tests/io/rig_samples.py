@@ -3,10 +3,7 @@
 import torch
 from hypothesis import strategies as st
 
-from torchface.correctives import Corrective, Correctives
-from torchface.mesh import Annotations, Mesh
-from torchface.rig import BlendshapeRig
-from torchface.take import Take, Track
+from torchface import Annotations, BlendshapeRig, Corrective, Correctives, Mesh, Take, Track
 
 
 def quad_sheet(columns: int = 6, rows: int = 5) -> Mesh:

@@ -7,25 +7,17 @@ from pathlib import Path
 import pytest
 from built_files import check_built
 
-from torchface.attachment import Attachment
-from torchface.capture.action_units.shape_table import load_shape_table
+from torchface import Attachment, load_mesh, load_rig, load_take
+from torchface.capture.action_units import load_shape_table
 from torchface.capture.retargeting import load_shape_rules
 from torchface.files.models import read_record
-from torchface.io import (
-    load_calibration,
-    load_correspondences,
-    load_landmark_points,
-    load_landmarks,
-    load_mesh,
-    load_rig,
-    load_take,
-)
+from torchface.io import load_calibration, load_correspondences, load_landmark_points, load_landmarks
 from torchface.io.action_labels import load_action_labels
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.gltf.detail_textures import read_gltf_detail
 from torchface.io.gltf.gltf_reading import read_gltf_rig
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
-from torchface.landmarks.scans.scan_annotations import load_annotations
+from torchface.landmarks import load_annotations
 
 CASES = int(os.environ.get("TORCHFACE_FUZZ_CASES", "12"))
 

@@ -9,12 +9,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.correctives import Corrective, Correctives
+from torchface import BlendshapeRig, Corrective, Correctives, Mesh
 from torchface.enhancement.wrinkle_maps.wrinkle_weights import RigWrinkles, WrinkleWeights
 from torchface.geometry.rotations import rotation_matrix
-from torchface.mesh import Mesh
 from torchface.onnx import export_wrinkle_weights
-from torchface.rig import BlendshapeRig
 
 NAMES = ("first", "second", "third")
 

@@ -10,22 +10,20 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from torchface import __version__
+from torchface import BlendshapeRig, Corrective, Correctives, __version__, save_rig
 from torchface.capture import DynamicsPrior, DynamicsSettings, ShapePrior, VideoSolver
 from torchface.capture.own_rig import VideoSettings
 from torchface.capture.priors import ParzenDensity
 from torchface.cli import main
-from torchface.correctives import Corrective, Correctives
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
-from torchface.io import save_calibration, save_rig
+from torchface.io import save_calibration
 from torchface.onnx import VideoGraph, VideoReport, export_video_solver
 from torchface.onnx import video_graph_export as video_export
 from torchface.onnx.exported_model import exported_model
 from torchface.onnx.unrolled_operators import TRANSLATIONS
 from torchface.onnx.video_graph_export import synthetic_landmarks
 from torchface.optim.exported_operators import symmetric_inverse
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
 K = torch.tensor([[700.0, 0, 319.5], [0, 700.0, 239.5], [0, 0, 1]], dtype=torch.float64)

@@ -8,17 +8,16 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchface import BlendshapeRig, Mesh
 from torchface.color_space import to_linear, to_srgb
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io.video import VideoFile, write_video
-from torchface.mesh import Mesh
 from torchface.progress import Progress, silent
 from torchface.rendering.clay_shading import sample_texture
 from torchface.rendering.point_light import PointLight
 from torchface.rendering.raycast import RayCaster
-from torchface.rig import BlendshapeRig
 
 _OFF_THE_SKIN = 0.3
 _WALL = (0.16, 0.18, 0.20)  # linear

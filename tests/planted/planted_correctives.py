@@ -3,8 +3,7 @@
 import torch
 from torch import Tensor
 
-from torchface.correctives.corrective_shapes import Corrective, Correctives
-from torchface.rig import BlendshapeRig
+from torchface import BlendshapeRig, Corrective, Correctives
 
 _IN_BETWEENS, _TRIPLES = 0.1, 0.15
 _PEAKS = (0.35, 0.5, 0.65)

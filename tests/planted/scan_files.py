@@ -3,11 +3,10 @@
 from collections.abc import Iterable
 from pathlib import Path
 
+from torchface import Mesh, save_mesh
 from torchface.files.documents import write_json
 from torchface.files.whole_files import all_or_none, made_folder
-from torchface.io.mesh_files import save_mesh
-from torchface.mesh import Mesh
-from torchface.synthetic.stages.scanner import RawScan, ScannerSettings, scan_head
+from torchface.synthetic.stages import RawScan, ScannerSettings, scan_head
 
 _MENPO_GROUPS = (
     ("chin", range(17)),

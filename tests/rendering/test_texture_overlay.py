@@ -9,6 +9,7 @@ import trimesh
 from torch import Tensor
 
 from planted.light_stage import LightStageSettings, lit_image, turning_cameras
+from torchface import BlendshapeRig, Mesh
 from torchface.color_space import to_linear, to_srgb
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration
@@ -16,12 +17,10 @@ from torchface.geometry.cameras.distortion import distort
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import triangle_normals
 from torchface.geometry.meshes.rasterization import rasterise_uvs
-from torchface.mesh import Mesh
 from torchface.rendering.pixel_coverage import footprint
 from torchface.rendering.point_light import PointLight
 from torchface.rendering.raycast import RayCaster
 from torchface.rendering.texture_overlay import FacePaint, _light_on, _soft_shadow, overlay, relight, skin_faces
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
 STAGE = LightStageSettings(width=240, height=240, samples=2, gloss=0.0, noise=0.0)

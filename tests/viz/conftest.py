@@ -6,8 +6,7 @@ import pytest
 import torch
 import trimesh
 
-from torchface.mesh import Mesh
-from torchface.rig import BlendshapeRig
+from torchface import BlendshapeRig, Mesh
 
 
 def ball(subdivisions: int, radius: float, centre: tuple[float, float, float]) -> tuple[torch.Tensor, torch.Tensor]:

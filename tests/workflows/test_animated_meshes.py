@@ -4,9 +4,7 @@ from pathlib import Path
 
 import torch
 
-from torchface.io import save_animation, save_mesh, save_rig, save_take
-from torchface.rig import BlendshapeRig
-from torchface.take import Take, Track
+from torchface import BlendshapeRig, Take, Track, save_animation, save_mesh, save_rig, save_take
 from torchface.workflows.animated_meshes import is_animation
 
 

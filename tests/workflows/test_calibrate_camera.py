@@ -16,14 +16,7 @@ from torchface.io import load_calibration, load_cameras, load_image, save_image
 from torchface.io.video import write_video
 from torchface.progress import silent
 from torchface.workflows.calibrate_beside import calibrate_beside
-from torchface.workflows.calibrate_camera import (
-    Board,
-    View,
-    calibrate,
-    calibrate_views,
-    find_boards,
-    find_corners,
-)
+from torchface.workflows.calibrate_camera import Board, View, calibrate, calibrate_views, find_boards, find_corners
 
 BOARD = Board(7, 5, 25.0)
 K = torch.tensor([[520.0, 0, 310.5], [0, 524, 247.2], [0, 0, 1]], dtype=torch.float64)

@@ -9,12 +9,10 @@ import torch
 
 from planted.characters import Planted, write_character
 from planted.glb_files import packed, unpacked
-from torchface import Attachment, Take, Track, save_take
+from torchface import Annotations, Attachment, BlendshapeRig, Mesh, Take, Track, save_mesh, save_rig, save_take
 from torchface.errors import FileFormatError
 from torchface.geometry.cameras.calibration import CameraCalibration
-from torchface.io import save_calibration, save_mesh, save_pts, save_rig
-from torchface.mesh import Annotations, Mesh
-from torchface.rig import BlendshapeRig
+from torchface.io import save_calibration, save_pts
 from torchface.synthetic import neutral_head, performer
 from torchface.workflows.convert_file import convert_file
 from torchface.workflows.describe_file import describe

@@ -6,13 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchface.attachment import Attachment
+from torchface import Attachment, BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.cli import main
 from torchface.errors import FileFormatError
-from torchface.io import load_take, save_rig, save_take
-from torchface.rig import BlendshapeRig
-from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
-from torchface.take import Take, Track
+from torchface.synthetic.stages import StageFlaws, place_markers, record
 from torchface.workflows.marker_input import load_label_map
 
 

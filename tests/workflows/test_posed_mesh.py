@@ -11,10 +11,8 @@ import torch
 from rig_samples import corrective_sheet
 
 from planted.glb_files import rewrite
+from torchface import BlendshapeRig, Take, Track, save_animation, save_mesh, save_rig, save_take
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.io import save_animation, save_mesh, save_rig, save_take
-from torchface.rig import BlendshapeRig
-from torchface.take import Take, Track
 from torchface.workflows.convert_file import convert_file
 from torchface.workflows.describe_file import describe
 from torchface.workflows.posed_mesh import load_posed, pose_weights

@@ -7,15 +7,14 @@ import numpy as np
 import pytest
 import torch
 
+from torchface import BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.capture import MarkerSolver
 from torchface.cli import main
-from torchface.io import load_animation, load_take, save_rig, save_take
+from torchface.io import load_animation
 from torchface.io.weights.live_link_csv import not_in_live_link
 from torchface.io.weights.weight_csv import ROTATIONS, load_weights_csv, save_weights_csv
-from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, spelled_as
-from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
-from torchface.take import Take, Track
+from torchface.synthetic.stages import StageFlaws, place_markers, record
 from torchface.workflows.weight_files import WeightFiles, reduced_take, weight_faults, write_weights
 
 DOME = ("jawOpen", "browInnerUp", "mouthSmileLeft", "mouthSmileRight")

@@ -36,7 +36,7 @@ def sculpt_corrective(
     options: SculptOptions | None = None,
     progress: Progress | None = None,
 ) -> tuple[SculptedCorrective, list[str]]:
-    """Reads a rig, its animation and detail maps, adds a corrective, writes all of it; with lines for people to read."""
+    """Reads a rig, its animation and detail maps, adds a corrective, writes all; gives lines for people to read."""
     progress, options = progress or silent, options or SculptOptions()
     if out.suffix.lower() not in BLENDER_ENDINGS:
         check_out(out)

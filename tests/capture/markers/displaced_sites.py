@@ -3,10 +3,9 @@
 import torch
 from torch import Tensor
 
-from torchface.attachment import Attachment
+from torchface import Attachment, BlendshapeRig
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.surface_index import SurfaceIndex
-from torchface.rig import BlendshapeRig
 
 _STEPS = 12
 

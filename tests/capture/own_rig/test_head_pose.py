@@ -11,13 +11,12 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
+from torchface import BlendshapeRig, load_rig, load_take
 from torchface.capture.own_rig.head_pose import STABLE_LANDMARKS, HeadPoses, measure_poses
 from torchface.errors import AlignmentError, ShapeError
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.geometry.cameras.pnp import pixel_jacobian, solve_pnp
 from torchface.geometry.rotations import rotation_matrix, rotation_vector
-from torchface.io import load_rig, load_take
-from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.synthetic import neutral_head, performer
 

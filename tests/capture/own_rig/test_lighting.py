@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from planted.light_stage import LightStageSettings, lit_image, render_lit_video, turning_cameras
+from torchface import BlendshapeRig, Mesh, load_rig
 from torchface.capture.own_rig.lighting import LightFit, estimate_light
 from torchface.color_space import to_linear, to_srgb
 from torchface.errors import AlignmentError, ShapeError, ValueRangeError
@@ -16,17 +17,14 @@ from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import undistort
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.io import load_rig
 from torchface.io.video import open_video
-from torchface.mesh import Mesh
-from torchface.modeling.photographs.texture_projection import photo_texture
+from torchface.modeling import photo_texture
 from torchface.rendering.camera_visibility import shown_in
 from torchface.rendering.point_light import PointLight, in_camera_frame, irradiance, lit_by, vertex_albedo
 from torchface.rendering.raycast import RayCaster
-from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.synthetic import draw_identities, performer
-from torchface.synthetic.stages.weight_curves import perform
+from torchface.synthetic.stages import perform
 
 STAGE = LightStageSettings(width=200, height=200, samples=1)
 

@@ -9,15 +9,14 @@ from hypothesis import strategies as st
 from torch import Tensor
 
 from planted.gaussian_density import gaussian
-from torchface.capture.own_rig import VideoSettings, VideoSolver, solve_whole_take
+from torchface import BlendshapeRig, Corrective, Correctives
+from torchface.capture import DynamicsPrior, ShapePrior, VideoSolver
+from torchface.capture.own_rig import VideoSettings, solve_whole_take
 from torchface.capture.own_rig.face_points import FacePoints
-from torchface.capture.priors import DynamicsPrior, ShapePrior
-from torchface.correctives import Corrective, Correctives
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
-from torchface.synthetic.stages.weight_curves import perform
+from torchface.synthetic.stages import perform
 
 K = torch.tensor([[700.0, 0, 319.5], [0, 700.0, 239.5], [0, 0, 1]], dtype=torch.float64)
 UPRIGHT = torch.diag(torch.tensor([1.0, -1, -1], dtype=torch.float64))

@@ -4,15 +4,14 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.correctives import Corrective, Correctives
+from torchface import BlendshapeRig, Corrective, Correctives
 from torchface.enhancement import EnhancementModel
 from torchface.enhancement.detail.detail_basis import LearnedBasis
 from torchface.enhancement.wrinkle_maps.wrinkle_basis import learn_wrinkle_basis
 from torchface.enhancement.wrinkle_maps.wrinkle_weights import RigWrinkles, WrinkleWeights, nearest_rotation
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
-from torchface.rig import BlendshapeRig
-from torchface.synthetic.head.performer import performer
+from torchface.synthetic import performer
 
 SHAPES = ("browInnerUp", "mouthSmileLeft", "mouthSmileRight", "mouthPucker", "mouthRollLower", "jawOpen")
 

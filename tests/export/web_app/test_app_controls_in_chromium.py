@@ -10,8 +10,7 @@ from recorded_take import Recorded, blob, watched
 from rig_samples import named_sheet, quad_sheet
 from test_gltf_viewers import WEB, node  # noqa: F401  (its packages)
 
-from torchface.io import load_take, save_mesh, save_rig
-from torchface.rig import BlendshapeRig
+from torchface import BlendshapeRig, load_take, save_mesh, save_rig
 from torchface.workflows.browser_app.character import load_character
 
 pytestmark = pytest.mark.browser

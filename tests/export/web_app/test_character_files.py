@@ -18,7 +18,7 @@ from test_vrm_in_browser import browser as vrm_browser  # noqa: F401  (three-vrm
 
 from planted.characters import Planted, write_character
 from planted.glb_files import rewrite
-from torchface.io import load_rig, load_take, save_rig
+from torchface import BlendshapeRig, load_rig, load_take, save_rig
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.gltf.gltf_document import read_document
@@ -26,7 +26,6 @@ from torchface.io.gltf.performance_animation import Performance, performed_glb
 from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.protocols.vmc_packets import VmcPackets
 from torchface.io.weights.weight_csv import save_weights_csv
-from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, VRM1, mapping
 from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.head_rotations import head_angles

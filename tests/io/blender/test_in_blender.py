@@ -9,13 +9,11 @@ import torch
 from rig_samples import corrective_sheet, named_sheet
 from scipy.spatial import cKDTree
 
+from torchface import BlendshapeRig, Corrective, Correctives, Take, Track, load_rig, save_animation, save_rig
 from torchface.cli import main
-from torchface.correctives import Corrective, Correctives
-from torchface.io import load_animation, load_rig, save_animation, save_rig
+from torchface.io import load_animation
 from torchface.io.blender.blender_files import blender_command
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
-from torchface.take import Take, Track
 
 pytestmark = pytest.mark.blender
 SCRIPT = Path(__file__).with_name("shown_in_blender.py")

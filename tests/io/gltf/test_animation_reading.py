@@ -9,12 +9,11 @@ from mutation import check_reader
 from rig_samples import sheet_rig, sheet_take
 
 from planted.glb_files import packed, rewrite, unpacked
+from torchface import Take, Track, save_animation, save_rig
 from torchface.errors import FileFormatError
-from torchface.io import save_animation, save_rig
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.performance_animation import Performance, performed_glb
-from torchface.take import Take, Track
 
 
 def edited(path: Path, change: dict, before: tuple[dict, ...] = (), after: tuple[dict, ...] = ()) -> Path:

@@ -8,13 +8,12 @@ import torch
 
 from planted.characters import Planted, write_character
 from planted.glb_files import packed, unpacked
+from torchface import Annotations, load_mesh
 from torchface.errors import FileFormatError
-from torchface.io import load_mesh
 from torchface.io.gltf.character_annotations import annotate_character
 from torchface.io.gltf.character_scene import read_character
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.morph_insertion import write_edited
-from torchface.mesh import Annotations
 from torchface.synthetic import performer
 
 TURN = torch.tensor([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]], dtype=torch.float64)

@@ -9,12 +9,9 @@ import torch
 from rig_samples import corrective_sheet, sheet_rig
 
 from planted.glb_files import packed, unpacked
-from torchface.correctives import Corrective, Correctives
+from torchface import BlendshapeRig, Corrective, Correctives, Take, Track, load_rig, save_animation, save_rig
 from torchface.errors import FileFormatError
-from torchface.io import load_rig, save_animation, save_rig
 from torchface.io.gltf.animation_reading import read_gltf_weights
-from torchface.rig import BlendshapeRig
-from torchface.take import Take, Track
 
 
 @pytest.mark.parametrize("name", ["rig.glb", "folder"])

@@ -11,12 +11,11 @@ import torch
 
 from planted.characters import Planted, write_character
 from planted.glb_files import packed, unpacked
-from torchface.errors import TorchfaceError
+from torchface import Mesh, TorchfaceError
 from torchface.io.gltf.character_scene import read_character
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.morph_insertion import AddedTargets, document_with_targets, write_edited
 from torchface.io.vrm.vrm_expressions import MorphBind, add_expressions
-from torchface.mesh import Mesh
 
 HEAD = Mesh(torch.tensor([[0.0, 0, 0], [50, 0, 0], [0, 50, 0]]), torch.tensor([[0, 1, 2]]))
 WRONG = (None, -1, 10**6, 0.5, "text", [], {}, [[]], True, 1e300)

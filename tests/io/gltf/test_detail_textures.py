@@ -15,11 +15,10 @@ from torch import Tensor
 
 import torchface.io.gltf.detail_textures
 from planted.glb_files import rewrite
+from torchface import BlendshapeRig, Mesh, load_rig, save_rig
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError
 from torchface.geometry.meshes.normal_maps import DetailMaps, decode_normals
-from torchface.io import load_detail_maps, load_image, load_rig, save_image16, save_normal_map, save_rig
-from torchface.mesh import Mesh
-from torchface.rig import BlendshapeRig
+from torchface.io import load_detail_maps, load_image, save_image16, save_normal_map
 
 
 def some_normals(*shape: int, seed: int = 0) -> Tensor:

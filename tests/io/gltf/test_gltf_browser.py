@@ -10,8 +10,7 @@ from test_gltf_viewers import node  # noqa: F401  (its packages)
 from torch import Tensor
 
 from planted.glb_files import rewrite
-from torchface.io import load_rig, save_mesh, save_rig
-from torchface.rig import BlendshapeRig
+from torchface import BlendshapeRig, load_rig, save_mesh, save_rig
 from torchface.synthetic import performer
 
 pytestmark = pytest.mark.browser

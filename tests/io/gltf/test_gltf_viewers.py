@@ -12,13 +12,11 @@ import torch
 from rig_samples import corrective_sheet, quad_sheet, sheet_rig, sheet_take
 from test_primitive_writing import head
 
+from torchface import BlendshapeRig, Mesh, load_rig, save_animation, save_mesh, save_rig
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.tangent_space import tangent_space
-from torchface.io import load_rig, save_animation, save_mesh, save_rig
 from torchface.io.gltf.part_textures.head_primitives import surfaces
-from torchface.mesh import Mesh
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
 WEB = Path(__file__).resolve().parent / "web"

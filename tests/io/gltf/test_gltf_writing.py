@@ -8,11 +8,8 @@ from hypothesis import given, settings
 from rig_samples import quad_sheet, rigs, sheet_rig, sheet_take
 
 from planted.glb_files import unpacked
+from torchface import BlendshapeRig, Mesh, Take, Track, load_mesh, load_rig, save_animation, save_mesh, save_rig
 from torchface.errors import FileFormatError, NameMismatchError, TopologyError, ValueRangeError
-from torchface.io import load_mesh, load_rig, save_animation, save_mesh, save_rig
-from torchface.mesh import Mesh
-from torchface.rig import BlendshapeRig
-from torchface.take import Take, Track
 
 MICROMETRES_10 = 1e-2  # millimetres: the 1e-5 m that a round trip may cost
 

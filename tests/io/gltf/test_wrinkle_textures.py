@@ -10,12 +10,11 @@ from test_gltf_viewers import assert_three_moves_it_alike, assert_valid, node  #
 from torch import Tensor
 
 from planted.glb_files import rewrite
+from torchface import BlendshapeRig, Mesh, load_rig, save_rig
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.normal_maps import normal_slopes
 from torchface.geometry.meshes.region_maps import RegionMaps
-from torchface.io import load_detail_maps, load_region_maps, load_rig, save_rig
-from torchface.mesh import Mesh
-from torchface.rig import BlendshapeRig
+from torchface.io import load_detail_maps, load_region_maps
 
 REGIONS = ("brow", "mouth", "nose", "chin")
 

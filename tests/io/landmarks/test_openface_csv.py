@@ -8,9 +8,8 @@ import torch
 from mutation import check_reader
 from take_strategies import check_refused, same
 
+from torchface import Take, Track, load_take, save_take
 from torchface.io.landmarks.openface_csv import load_landmarks_csv, save_landmarks_csv
-from torchface.io.take_files import load_take, save_take
-from torchface.take import Take, Track
 
 _GOOD = """frame, timestamp, confidence, success, x_0, x_1, y_0, y_1, X_0, AU01_r
 1, 0, 0.9, 1, 10, 11, 20, 21, 5, 0.5

@@ -9,15 +9,12 @@ from hypothesis import HealthCheck, given, settings
 from maya_scene import MayaScene, statements
 from rig_samples import corrective_sheet, rigs, sheet_rig
 
+from torchface import BlendshapeRig, Corrective, Correctives, Take, Track, save_animation, save_rig
 from torchface.cli import main
-from torchface.correctives import Corrective, Correctives
 from torchface.errors import FileFormatError
 from torchface.geometry.meshes.normal_maps import DetailMaps
-from torchface.io import save_animation, save_rig
 from torchface.io.maya.maya_writing import maya_notes
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
-from torchface.take import Take, Track
 
 MILLIMETRES = 1e-4
 

@@ -8,10 +8,8 @@ from hypothesis import given, settings
 from mutation import check_reader
 from rig_samples import quad_sheet, rigs
 
-from torchface.errors import FileFormatError, TopologyError, TorchfaceError
-from torchface.io import load_mesh, save_mesh
-from torchface.mesh import Mesh
-from torchface.rig import BlendshapeRig
+from torchface import BlendshapeRig, Mesh, TorchfaceError, load_mesh, save_mesh
+from torchface.errors import FileFormatError, TopologyError
 
 ASCII_PLY = """ply
 format ascii 1.0

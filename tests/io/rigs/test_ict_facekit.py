@@ -8,10 +8,9 @@ import trimesh
 from mutation import check_reader
 from rig_samples import quad_sheet
 
+from torchface import BlendshapeRig, Mesh, load_rig, save_mesh
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, TopologyError
-from torchface.io import load_identity_modes, load_rig, save_mesh
-from torchface.mesh import Mesh
-from torchface.rig import BlendshapeRig
+from torchface.io import load_identity_modes
 
 INDICES = {"expressions": ["jawOpen", "jawLeft"], "idx_to_landmark_verts": [3, 17, 0]}
 

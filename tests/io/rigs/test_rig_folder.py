@@ -9,11 +9,10 @@ import torch
 from mutation import check_reader
 from rig_samples import quad_sheet, sheet_rig
 
+from torchface import BlendshapeRig, Mesh, load_rig, save_mesh, save_rig
 from torchface.errors import AlignmentError, FileFormatError, NameMismatchError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.normal_maps import DetailMaps, decode_normals
-from torchface.io import load_image, load_rig, save_mesh, save_rig
-from torchface.mesh import Mesh
-from torchface.rig import BlendshapeRig
+from torchface.io import load_image
 from torchface.synthetic import performer
 
 

@@ -7,10 +7,9 @@ import pytest
 import torch
 
 from planted.characters import Planted, write_character
-from torchface.io import load_mesh, load_rig
+from torchface import Mesh, load_mesh, load_rig
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.vrm.vrm_expressions import MorphBind, add_expressions, vrm_expressions, vrm_version
-from torchface.mesh import Mesh
 
 HEAD = Mesh(torch.tensor([[0.0, 0, 0], [50, 0, 0], [0, 50, 0]]), torch.tensor([[0, 1, 2]]))
 SHAPES = {"Fcl_EYE_Close_L": torch.ones(3, 3), "grin": torch.ones(3, 3)}

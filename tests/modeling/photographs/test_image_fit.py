@@ -8,8 +8,7 @@ import torch
 from torch import Tensor
 
 from planted.photographed_heads import EXPRESSION, SIZE, Person, aligned_error, person, portraits
-from torchface import zoo
-from torchface.attachment import Attachment
+from torchface import Attachment, BlendshapeRig, zoo
 from torchface.errors import ShapeError
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.geometry.cameras.pinhole import look_at
@@ -20,7 +19,6 @@ from torchface.modeling.photographs.fit_settings import SurfacePoints
 from torchface.modeling.photographs.image_fit import contour_curves, smooth_differences, with_whole_eyeballs
 from torchface.modeling.photographs.image_input import annotated_vertices
 from torchface.modeling.photographs.landmark_view import LandmarkSites, LinearPoints
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, neutral_head, performer
 
 FIXED = FitSettings(sliding=False, contour_slide=1.0, one_expression=True)

@@ -8,14 +8,12 @@ import torch
 from torch import Tensor
 
 from planted.photographed_heads import SIZE, person
-from torchface.attachment import Attachment
+from torchface import Attachment, BlendshapeRig, Mesh
 from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io import load_identity_modes, load_image, load_landmark_points
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
-from torchface.mesh import Mesh
 from torchface.modeling import FitSettings, HeadModel, MorphableModel, fit_images
-from torchface.rig import BlendshapeRig
 
 
 @pytest.fixture(scope="module")

@@ -3,11 +3,10 @@
 import torch
 
 from planted.characters import other_topology
+from torchface import Annotations, BlendshapeRig, Mesh
 from torchface.geometry.meshes.operators import components
 from torchface.geometry.similarity import Similarity
-from torchface.mesh import Annotations, Mesh
 from torchface.modeling.rigging.annotated_heads import annotations_on
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
 SAME = Similarity(torch.ones(1).double(), torch.eye(3).double()[None], torch.zeros(1, 3).double())

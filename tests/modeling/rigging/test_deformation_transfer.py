@@ -8,14 +8,12 @@ import torch
 from torch import Tensor
 
 from planted.characters import caricature
-from torchface.correctives import Corrective, Correctives
+from torchface import BlendshapeRig, Corrective, Correctives, Mesh
 from torchface.errors import AlignmentError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.operators import components
 from torchface.io import load_ict_facekit, load_identity_modes
-from torchface.mesh import Mesh
 from torchface.modeling import rig_from_examples, transfer_deformation, transfer_with_report
 from torchface.registration.own_topology import check_own_topology
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, neutral_head, performer
 
 SHELLS = ("lacrimal_fluid", "eye_blend", "eye_occlusion")

@@ -9,13 +9,12 @@ from scipy.optimize import lsq_linear
 from torch import Tensor
 
 from planted.asked_expressions import EXAMPLES
-from torchface.errors import ShapeError, TopologyError, TorchfaceError, ValueRangeError
-from torchface.mesh import Mesh
-from torchface.modeling.rigging.deformation_transfer import transfer_with_report
+from torchface import BlendshapeRig, Mesh, TorchfaceError
+from torchface.errors import ShapeError, TopologyError, ValueRangeError
+from torchface.modeling import RiggingSchedule, rig_from_examples, transfer_with_report
 from torchface.modeling.rigging.example_gradients import example_shares, personal_part, shape_stiffness
-from torchface.modeling.rigging.example_rigging import RiggingSchedule, angles_between, rig_from_examples
+from torchface.modeling.rigging.example_rigging import angles_between
 from torchface.optim import box_qp
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 
 SHORT = RiggingSchedule(iterations=4)

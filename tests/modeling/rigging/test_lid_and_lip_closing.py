@@ -7,12 +7,11 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchface import Annotations, BlendshapeRig, Mesh
 from torchface.geometry.meshes.contact import ContactFinder
-from torchface.io.rigs.ict_facekit import load_ict_facekit, load_identity_modes
-from torchface.mesh import Annotations, Mesh
-from torchface.modeling.rigging.deformation_transfer import transfer_with_report
+from torchface.io import load_ict_facekit, load_identity_modes
+from torchface.modeling import transfer_with_report
 from torchface.modeling.rigging.lid_and_lip_closing import find_seams
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 
 COLUMNS = 31

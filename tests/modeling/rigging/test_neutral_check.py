@@ -7,14 +7,13 @@ import torch
 from torch import Tensor
 
 from planted.characters import caricature
+from torchface import BlendshapeRig, Mesh, load_rig, save_mesh, save_rig
 from torchface.cli import main
 from torchface.errors import TopologyError
 from torchface.geometry.similarity import similarity_transform
-from torchface.io import load_ict_facekit, load_identity_modes, load_rig, save_mesh, save_rig
-from torchface.mesh import Mesh
+from torchface.io import load_ict_facekit, load_identity_modes
 from torchface.modeling import neutral_notes
 from torchface.modeling.rigging.neutral_check import pose_notes
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, neutral_head, performer
 
 LYING = torch.tensor([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])

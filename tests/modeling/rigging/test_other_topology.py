@@ -5,15 +5,13 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchface import Mesh
+from torchface import Annotations, BlendshapeRig, Mesh
 from torchface.errors import ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import Similarity
-from torchface.mesh import Annotations
-from torchface.modeling.rigging.carried_shapes import CarriedShapes
+from torchface.modeling import CarriedShapes, shapes_on
 from torchface.modeling.rigging.joined_vertices import joined_vertices
-from torchface.modeling.rigging.other_topology import TemplatePlaces, shapes_on
-from torchface.rig import BlendshapeRig
+from torchface.modeling.rigging.other_topology import TemplatePlaces
 from torchface.synthetic import performer
 
 SHAPES = ["eyeBlinkLeft", "eyeLookOutLeft", "jawOpen", "mouthSmileLeft", "mouthPucker", "browInnerUp"]

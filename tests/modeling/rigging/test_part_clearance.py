@@ -8,17 +8,16 @@ import torch
 from torch import Tensor
 
 from planted.characters import caricature
+from torchface import BlendshapeRig, Mesh
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io import load_ict_facekit, load_identity_modes
-from torchface.mesh import Mesh
 from torchface.modeling import InnerParts, clear_parts, inner_parts, place_parts, shape_depths, transfer_with_report
 from torchface.modeling.rigging.part_placement import with_mouth_behind_skin, with_placed_parts
 from torchface.modeling.rigging.penetration import TOLERANCE
 from torchface.modeling.rigging.transfer_system import ShapeTransfer
 from torchface.registration import Registration
 from torchface.rendering.raycast import RayCaster
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import IDENTITY, performer
 
 MOVED = torch.tensor([1.5, -1.0, -2.5])

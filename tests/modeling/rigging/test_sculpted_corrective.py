@@ -5,12 +5,11 @@ import torch
 from torch import Tensor
 
 from planted.planted_correctives import planted_correctives
-from torchface.correctives import Corrective
-from torchface.errors import AlignmentError, NameMismatchError, TopologyError, TorchfaceError, ValueRangeError
+from torchface import BlendshapeRig, Corrective, Mesh, TorchfaceError
+from torchface.errors import AlignmentError, NameMismatchError, TopologyError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
-from torchface.mesh import Mesh
-from torchface.modeling.rigging.sculpted_corrective import checked_sculpt, corrective_from_sculpt
-from torchface.rig import BlendshapeRig
+from torchface.modeling import corrective_from_sculpt
+from torchface.modeling.rigging.sculpted_corrective import checked_sculpt
 from torchface.synthetic import performer
 
 NAMES = ("jawOpen", "mouthSmileLeft", "mouthPucker", "browInnerUp", "eyeBlinkLeft")

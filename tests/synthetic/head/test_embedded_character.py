@@ -3,13 +3,12 @@
 import pytest
 import torch
 
+from torchface import BlendshapeRig, load_rig, save_rig
 from torchface.errors import TopologyError
 from torchface.geometry.meshes.operators import components
 from torchface.geometry.similarity import similarity_transform
-from torchface.io import load_rig, save_rig
 from torchface.modeling import inner_parts
 from torchface.rendering.raycast import RayCaster
-from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
 from torchface.synthetic import IDENTITY, Look, character, draw_identities, performer
 from torchface.synthetic.head.hair_locks import hair_locks

@@ -10,12 +10,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from torchface import BlendshapeRig, Take, Track, load_take
 from torchface.cli.pick import pick
 from torchface.cli.view import view
 from torchface.errors import MissingExtraError, NameMismatchError, ValueRangeError
-from torchface.io import load_take
-from torchface.rig import BlendshapeRig
-from torchface.take import Take, Track
 from torchface.viz.browser.browser_page import LAST_PORT, free_port
 from torchface.viz.browser.rig_viewer import RigViewer
 

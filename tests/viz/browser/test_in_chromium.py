@@ -16,11 +16,9 @@ from headless_chromium import until
 from PIL import Image
 from torch import Tensor
 
+from torchface import BlendshapeRig, Mesh, Take, Track
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.operators import vertex_normals
-from torchface.mesh import Mesh
-from torchface.rig import BlendshapeRig
-from torchface.take import Take, Track
 from torchface.viz.browser.browser_page import SCALE
 from torchface.viz.browser.head_mesh import OVER
 from torchface.viz.browser.landmark_sets import custom_set

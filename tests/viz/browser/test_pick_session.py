@@ -3,11 +3,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchface.attachment import Attachment
+from torchface import Annotations, Attachment, BlendshapeRig, Mesh, load_mesh, load_rig
 from torchface.errors import ValueRangeError
-from torchface.io import load_correspondences, load_landmarks, load_mesh, load_rig
-from torchface.mesh import Annotations, Mesh
-from torchface.rig import BlendshapeRig
+from torchface.io import load_correspondences, load_landmarks
 from torchface.viz.browser.landmark_sets import IBUG_68, THESIS_12, custom_set
 from torchface.viz.browser.pick_session import PickSession, SurfacePoint
 from torchface.viz.browser.picker import save_picks

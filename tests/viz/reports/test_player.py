@@ -10,10 +10,9 @@ import torch
 import trimesh
 from PIL import Image
 
+from torchface import Annotations, BlendshapeRig, Mesh
 from torchface.errors import ShapeError
-from torchface.mesh import Annotations, Mesh
 from torchface.rendering.part_colors import clear_triangles, region_colors
-from torchface.rig import BlendshapeRig
 from torchface.viz.reports.player import Markers, Panel, Played, Player, write_player
 from torchface.viz.reports.report_page import Section, write_page
 

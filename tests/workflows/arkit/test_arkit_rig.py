@@ -6,14 +6,12 @@ import pytest
 import torch
 import trimesh
 
-from torchface import Mesh
+from torchface import Annotations, BlendshapeRig, Mesh, save_rig
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
-from torchface.io import load_ict_facekit, save_rig
-from torchface.mesh import Annotations
+from torchface.io import load_ict_facekit
+from torchface.modeling import shapes_on
 from torchface.modeling.rigging.mouth_parts import tongue_out
-from torchface.modeling.rigging.other_topology import shapes_on
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.workflows.arkit import arkit_rig
 from torchface.workflows.arkit.arkit_rig import Source, head_of, make_arkit

@@ -9,12 +9,10 @@ from pathlib import Path
 import pytest
 import torch
 
+from torchface import BlendshapeRig, Mesh, load_rig, load_take, save_mesh, save_rig
 from torchface.capture import MarkerSolver
 from torchface.errors import TopologyError, ValueRangeError
-from torchface.io import load_rig, load_take, save_mesh, save_rig
-from torchface.mesh import Mesh
 from torchface.onnx import SolverReport
-from torchface.rig import BlendshapeRig
 from torchface.synthetic.head.embedded_character import shown_rig
 from torchface.workflows.demo.demo_page import result_rows, scene_rows, write_demo_page
 from torchface.workflows.demo.run_demo import FLAWS, embedded_scene, run_demo, scene_from

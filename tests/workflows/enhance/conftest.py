@@ -7,15 +7,10 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface import zoo
-from torchface.attachment import Attachment
+from torchface import Attachment, BlendshapeRig, Mesh, Take, Track, save_rig, save_take, zoo
 from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
-from torchface.io import save_rig, save_take
-from torchface.mesh import Mesh
-from torchface.rig import BlendshapeRig
-from torchface.synthetic.head.performer import performer
-from torchface.synthetic.stages.marker_stage import place_markers
-from torchface.take import Take, Track
+from torchface.synthetic import performer
+from torchface.synthetic.stages import place_markers
 
 FPS = 30.0
 FRAMES = 12

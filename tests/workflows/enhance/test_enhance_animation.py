@@ -10,8 +10,20 @@ import pytest
 import torch
 
 from tests.workflows.enhance.conftest import FPS, FRAMES, Actor, folded
-from torchface import zoo
-from torchface.attachment import Attachment
+from torchface import (
+    Attachment,
+    BlendshapeRig,
+    Mesh,
+    Take,
+    Track,
+    load_rig,
+    load_take,
+    save_animation,
+    save_mesh,
+    save_rig,
+    save_take,
+    zoo,
+)
 from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.errors import (
     AlignmentError,
@@ -23,25 +35,11 @@ from torchface.errors import (
 )
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import similarity_transform
-from torchface.io import (
-    MeshSequence,
-    load_image,
-    load_rig,
-    load_take,
-    save_animation,
-    save_mesh,
-    save_rig,
-    save_take,
-)
+from torchface.io import Correspondences, MeshSequence, MeshSequenceWriter, load_image, save_correspondences
 from torchface.io.gltf.animation_reading import read_gltf_weights
-from torchface.io.landmarks.picks import Correspondences, save_correspondences
-from torchface.io.meshes.mesh_sequence import MeshSequenceWriter
-from torchface.mesh import Mesh
 from torchface.progress import silent
 from torchface.registration import Registration
 from torchface.rendering.clay_shading import sample_texture
-from torchface.rig import BlendshapeRig
-from torchface.take import Take, Track
 from torchface.workflows.animated_meshes import load_animated
 from torchface.workflows.enhance import enhance_views, enhanced_frames, head_correspondence
 from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse

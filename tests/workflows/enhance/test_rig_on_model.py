@@ -7,11 +7,10 @@ import pytest
 import torch
 
 from tests.workflows.enhance.conftest import Actor
+from torchface import BlendshapeRig, Mesh
 from torchface.errors import AlignmentError, ShapeError
 from torchface.geometry.rotations import rotation_matrix
-from torchface.mesh import Mesh
 from torchface.progress import silent
-from torchface.rig import BlendshapeRig
 from torchface.workflows.enhance.rig_on_model import RigOnModel, rig_on_model
 
 

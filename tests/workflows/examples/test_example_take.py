@@ -6,14 +6,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from torchface import Take, Track, load_take
 from torchface.capture.anybody import ExampleShapes, paper_examples
 from torchface.cli import main
 from torchface.errors import NameMismatchError, ValueRangeError
-from torchface.io import load_take
 from torchface.io.landmarks.openface_csv import save_landmarks_csv
 from torchface.landmarks.images.tracking.video_landmarks import LANDMARK_NAMES
 from torchface.synthetic import performer
-from torchface.take import Take, Track
 from torchface.workflows.examples.example_take import averaged_examples, solve_by_examples, track_by_examples
 
 

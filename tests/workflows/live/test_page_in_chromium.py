@@ -15,12 +15,11 @@ from PIL import Image
 from planted_faces import JAW, Desk, Endless, ShadeSolver
 from websockets.sync.client import connect
 
+from torchface import BlendshapeRig, save_rig
 from torchface.errors import MissingExtraError
-from torchface.io import save_rig
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.weights.live_link_csv import load_live_link
 from torchface.progress import silent
-from torchface.rig import BlendshapeRig
 from torchface.workflows.browser_app.built_page import built_page
 from torchface.workflows.live import live_anybody
 from torchface.workflows.live.live_anybody import LiveSettings, go_live

@@ -8,13 +8,14 @@ import torch
 from torch import Tensor
 
 from planted.light_stage import LightStageSettings, lit_image, render_lit_video
+from torchface import BlendshapeRig, Take, Track, save_animation, save_rig
 from torchface.cli import main
 from torchface.color_space import to_linear, to_srgb
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.files.documents import write_json
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.rasterization import rasterise_uvs
-from torchface.io import save_animation, save_image, save_rig
+from torchface.io import save_image
 from torchface.io.landmarks.openface_csv import save_landmarks_csv
 from torchface.io.video import open_video, write_video
 from torchface.landmarks.images.networks.part_finder import FaceParts
@@ -23,9 +24,7 @@ from torchface.modeling.photographs.skin_mask import FacePlaces
 from torchface.rendering.pixel_coverage import footprint
 from torchface.rendering.point_light import PointLight
 from torchface.rendering.texture_overlay import relight, skin_faces
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import neutral_head, performer
-from torchface.take import Take, Track
 from torchface.workflows.head_rotations import rotation_columns
 from torchface.workflows.relight.other_head import other_head, without_painted_hair
 from torchface.workflows.relight.relight_film import (

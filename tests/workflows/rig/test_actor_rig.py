@@ -9,16 +9,14 @@ import torch
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from torchface import zoo
+from torchface import BlendshapeRig, Mesh, load_rig, save_mesh, save_rig, zoo
 from torchface.cli import main
 from torchface.errors import AlignmentError, FileFormatError, TopologyError, ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
-from torchface.io import Correspondences, load_detail_maps, load_rig, save_correspondences, save_mesh, save_rig
-from torchface.mesh import Mesh
+from torchface.io import Correspondences, load_detail_maps, save_correspondences
 from torchface.modeling import MorphableModel, transfer_deformation
 from torchface.registration import Registration, hidden_parts, in_place_of, with_template_skin
 from torchface.registration.nonrigid.registration_record import RegistrationRecord
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import neutral_head, performer
 from torchface.workflows.rig import actor_rig
 from torchface.workflows.rig.actor_rig import RigOptions, rig_actor

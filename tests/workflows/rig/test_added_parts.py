@@ -8,14 +8,13 @@ import torch
 
 from planted.characters import Planted, write_character
 from planted.glb_files import unpacked
+from torchface import BlendshapeRig, Mesh
 from torchface.geometry.meshes.operators import border_edges
 from torchface.geometry.similarity import Similarity
 from torchface.io.gltf.character_scene import Character, read_character
 from torchface.io.gltf.gltf_document import read_document
 from torchface.landmarks.surfaces.face_on_surface import FaceOnSurface, FaceSearch
-from torchface.mesh import Mesh
 from torchface.rendering.raycast import RayCaster
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
 from torchface.workflows.rig.character_face import character_search
 from torchface.workflows.rig.character_rig import CharacterReport, rig_character

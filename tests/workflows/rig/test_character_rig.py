@@ -11,16 +11,14 @@ import torch
 
 from planted.characters import Planted, box_mesh, caricature, decimated, write_character
 from planted.glb_files import packed, unpacked
+from torchface import BlendshapeRig, Mesh, load_rig
 from torchface.cli import main
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
-from torchface.io import load_rig
 from torchface.io.gltf.character_scene import Character, read_character
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.vrm.vrm_expressions import vrm_expressions
 from torchface.landmarks.surfaces.face_on_surface import FaceOnSurface, FaceSearch, NoFaceOnSurfaceError
-from torchface.mesh import Mesh
-from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT
 from torchface.synthetic import draw_identities, performer
 from torchface.workflows.rig import character_face, character_rig

@@ -6,15 +6,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.errors import (
-    AlignmentError,
-    FileFormatError,
-    NameMismatchError,
-    ShapeError,
-    TorchfaceError,
-    ValueRangeError,
-)
-from torchface.rig import BlendshapeRig
+from torchface import BlendshapeRig, TorchfaceError
+from torchface.errors import AlignmentError, FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.shape_names import mirror
 from torchface.synthetic import performer
 from torchface.workflows.rig.expression_scans import check_side, expressions_in, neutral_in, seen_example

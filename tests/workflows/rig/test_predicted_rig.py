@@ -6,12 +6,10 @@ from pathlib import Path
 import pytest
 import torch
 
-from torchface import zoo
+from torchface import BlendshapeRig, load_rig, save_mesh, save_rig, zoo
 from torchface.cli import main
 from torchface.errors import NameMismatchError, TopologyError
-from torchface.io import load_rig, save_mesh, save_rig
 from torchface.modeling import ExpressionRegression
-from torchface.rig import BlendshapeRig
 from torchface.workflows.rig.predicted_rig import predict_rig
 
 

@@ -9,13 +9,12 @@ import torch
 from torch import Tensor
 
 from planted.characters import caricature
+from torchface import BlendshapeRig, Mesh
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import Similarity
-from torchface.mesh import Mesh
 from torchface.registration import Registration
 from torchface.registration.nonrigid.registration_record import RegistrationRecord
-from torchface.rig import BlendshapeRig
-from torchface.synthetic.head.performer import performer
+from torchface.synthetic import performer
 from torchface.workflows.rig.shut_eyes import eyes_shut_at_rest, with_eye_note, with_shut_eyes
 
 

@@ -9,15 +9,12 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface.attachment import Attachment
+from torchface import Attachment, BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.capture import HelmetSolver, MarkerSolver
 from torchface.cli import main
 from torchface.errors import ValueRangeError
 from torchface.geometry.similarity import Similarity
-from torchface.io import load_take, save_rig, save_take
-from torchface.rig import BlendshapeRig
-from torchface.synthetic.stages.marker_stage import StageFlaws, place_markers, record
-from torchface.take import Take, Track
+from torchface.synthetic.stages import StageFlaws, place_markers, record
 from torchface.workflows.marker_input import scale_warnings
 from torchface.workflows.solve.take_check import check_coverage
 

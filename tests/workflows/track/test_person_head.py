@@ -8,15 +8,13 @@ import torch
 from torch import Tensor
 
 from planted.photographed_heads import aligned_error
-from torchface import load_rig, save_rig
+from torchface import BlendshapeRig, Take, Track, load_rig, save_rig
 from torchface.errors import TopologyError
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.similarity import similarity_transform
 from torchface.io.landmarks.openface_csv import save_landmarks_csv
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
-from torchface.take import Take, Track
 from torchface.workflows.track.track_inputs import TrackSettings
 from torchface.workflows.track.track_video import track_video
 

@@ -2,8 +2,7 @@
 
 import torch
 
-from torchface.correctives import Corrective, Correctives
-from torchface.rig import BlendshapeRig
+from torchface import BlendshapeRig, Corrective, Correctives
 from torchface.synthetic import performer
 from torchface.workflows.track.upright_rig import upright
 

@@ -7,11 +7,9 @@ import pytest
 import torch
 from torch import Tensor
 
+from torchface import Annotations, BlendshapeRig, load_rig
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.meshes.operators import triangle_normals, vertex_normals
-from torchface.io import load_rig
-from torchface.mesh import Annotations
-from torchface.rig import BlendshapeRig
 from torchface.synthetic.stages.subdivision import catmull_clark
 from torchface.synthetic.stages.wrinkles import FOLD_TIME, UNFOLD_TIME, WrinkledPerformer
 from torchface.synthetic.stages.wrinkles.skin_texture_relief import pore_heights
