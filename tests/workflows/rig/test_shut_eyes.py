@@ -15,6 +15,7 @@ from torchface.geometry.similarity import Similarity
 from torchface.registration import Registration
 from torchface.registration.nonrigid.registration_record import RegistrationRecord
 from torchface.synthetic import performer
+from torchface.workflows.register.scan_expression import front_view
 from torchface.workflows.rig.shut_eyes import eyes_shut_at_rest, with_eye_note, with_shut_eyes
 
 
@@ -52,7 +53,9 @@ def test_a_scans_texture_shows_its_eyes(rig: BlendshapeRig, blink: float, taken:
     turn = rotation_matrix(torch.tensor([0.4, 2.0, -0.3]))
     scan = seen.with_vertices(seen.vertices @ turn.T + 300)  # in any pose
     found = exact(replace(scan, texture=None, colors=None), torch.zeros(len(scan.vertices)))
-    notes = with_eye_note(rig, scan, found, weights(rig, taken), no_second_fit).record.notes
+    notes = with_eye_note(
+        rig, front_view(scan, found, rig.neutral), found, weights(rig, taken), no_second_fit
+    ).record.notes
     assert len(notes) == bool(note)
     if note:
         assert re.search(note, notes[0])
@@ -83,7 +86,9 @@ def test_each_eye_is_judged_for_itself(
     plain = replace(scan, texture=None, colors=None)
     found = fitted(pose(*taken)) if not colored else exact(plain, torch.zeros(len(scan.vertices)))
     second = no_second_fit if colored else fitted
-    notes = with_eye_note(rig, scan if colored else plain, found, pose(*taken), second).record.notes
+    notes = with_eye_note(
+        rig, front_view(scan if colored else plain, found, rig.neutral), found, pose(*taken), second
+    ).record.notes
     assert len(notes) == bool(note)
     if note:
         assert re.search(note, notes[0])
@@ -101,7 +106,7 @@ def test_without_colours_two_fits_say_which_lids_they_are(
         return exact(scan, torch.full((len(scan.vertices),), shut_fit))
 
     first = exact(scan, torch.full((len(scan.vertices),), open_fit))
-    notes = with_eye_note(rig, scan, first, weights(rig, 0.0), second).record.notes
+    notes = with_eye_note(rig, front_view(scan, first, rig.neutral), first, weights(rig, 0.0), second).record.notes
     assert torch.equal(asked[0], weights(rig, 1.0))
     assert [("eyes are shut, as the lids' shape says" in note) for note in notes] == [True] * shut
 

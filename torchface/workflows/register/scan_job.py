@@ -32,8 +32,9 @@ from torchface.viz.figures.registration_views import lines_on_clay
 from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.batch.contact_sheet import HEIGHT, WIDTH
 from torchface.workflows.batch.outcomes import RESULT, Made, word_of
+from torchface.workflows.register.scan_expression import front_view, shown_expression
 
-_METHOD = "register/8"
+_METHOD = "register/9"
 """What results are made with; another number where the same scan and settings come to give another result."""
 _MAX_DISTANCE = 1.0  # end of the distance maps' scale, millimetres
 
@@ -117,6 +118,12 @@ class ScanJob:
         if left_out:
             notes = tuple(note for note in registration.record.notes if note != NO_COLORS)
             registration = replace(registration, record=replace(registration.record, notes=notes))
+        view = front_view(mesh, registration, self.template)
+        if view is not None and (seen := shown_expression(view)):
+            # Scans of expressions are registered too, so this is no warning.
+            said = f"not at rest, as the landmark network sees it from the front: {seen}"
+            record = registration.record
+            registration = replace(registration, record=replace(record, notes=(*record.notes, said)))
         shapeless = BlendshapeRig(self.template, torch.zeros(0, len(self.template.vertices), 3), ())
         return with_placed_parts(shapeless, registration), 0 if landmarks is None else len(landmarks[0])
 

@@ -54,6 +54,7 @@ from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 from torchface.viz import registration_sheet
 from torchface.workflows.register.register_scans import load_shape_model
+from torchface.workflows.register.scan_expression import front_view, shown_expression
 from torchface.workflows.rig.actor_report import ActorReport
 from torchface.workflows.rig.expression_scans import (
     LAYOUT,
@@ -149,12 +150,13 @@ def _rig_actor(
     if model is not None and bool(shown.any()):
         raise ValueRangeError("model: found a pose beside a model of heads at rest, expected one of the two")
     registration = job.registered(job.posed(rig, shown), scan, landmarks, options.texture_size, model)
-    bent, parts = registration.record.bent, inner_parts(rig)
+    bent, parts, view = registration.record.bent, inner_parts(rig), None
     if bent:
-        progress("looking at the eyes")
+        progress("looking at the scan")
+        view = front_view(job.read(scan), registration, rig.neutral)
         registration = with_eye_note(
             rig,
-            job.read(scan),
+            view,
             registration,
             shown,
             lambda weights: job.registered(job.posed(rig, weights), scan, landmarks, 0),
@@ -168,6 +170,12 @@ def _rig_actor(
         neutral = with_mouth_behind_skin(place_parts(rig, neutral, parts))
     transferred = transfer_with_report(rig, neutral, progress=progress)
     doubts = (*pose_notes(rig, found, shown), *neutral_notes(rig, neutral))
+    seen = "" if view is None else shown_expression(view, rig.names, shown)
+    if seen and not any("neutral is likely not at rest" in doubt for doubt in doubts):
+        doubts += (
+            f"the scan is likely not at rest: from the front it shows {seen}, as the landmark network sees it, and so "
+            f"does the neutral; torchface rig --pose {seen} takes it out",
+        )
     notes = (*registration.record.notes, *(f"warning: {note}" for note in doubts))
     registration = replace(registration, record=replace(registration.record, notes=notes))
     actor: BlendshapeRig = transferred.rig

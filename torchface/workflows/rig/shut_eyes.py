@@ -7,31 +7,24 @@ import torch
 from torch import Tensor
 
 from torchface.errors import TorchfaceError
-from torchface.geometry.similarity import similarity_transform
-from torchface.landmarks.images.box_landmarks import settled_face
-from torchface.landmarks.images.ibug_68 import COUNT, box_around
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.eyelid_closure import SkinOfHead, eyes_seen
 from torchface.modeling.rigging.joined_vertices import joined_vertices
 from torchface.registration import Registration
-from torchface.registration.scan_colors import has_colors
-from torchface.rendering.clay_shading import render
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
-from torchface.viz.figures.face_views import frame_face
-from torchface.workflows.named_finders import load_finder
+from torchface.workflows.register.scan_expression import FrontView
 from torchface.workflows.rig.character_face import CharacterFace
 
 _BLINKS, _SIDES = ("eyeBlinkLeft", "eyeBlinkRight"), ("left", "right")
 # Likelihoods of the eye network: 0.9 and more of shut eyes, 0.08 at most of open and half shut ones.
-_SHUT, _OPEN, _LEAST_PRESENCE = 0.6, 0.3, 0.9
+_SHUT, _OPEN = 0.6, 0.3
 _LIDS = 2.0  # millimetres that a blink moves skin of the lids
 # Mean distance of an eye's lids in the fit with shut eyes over that with open ones: with ICT's template 0.07 to 0.35
 # where they are shut, 1.6 and more where they are open; with the performer's, on ICT's heads, 0.59 to 1.15 where they
 # are shut and 0.42 to 1.92 where they are open, which says little.
 _BETTER, _WORSE = 0.4, 1.6
-_WIDTH, _HEIGHT = 480, 600
 _BLINKS_OF = ("Right", "Left")  # in the order of iBUG's eyes
 _BALL, _HIDDEN = 2.6, 0.75  # radii of a reference's eyeball; the share of a ball's front that skin covers
 _LID = 0.3  # of a blink's longest way: from there on a vertex is of the lids alone
@@ -39,21 +32,21 @@ _LID = 0.3  # of a blink's longest way: from there on a vertex is of the lids al
 
 def with_eye_note(
     rig: BlendshapeRig,
-    scan: Mesh,
+    view: FrontView | None,
     registration: Registration,
     shown: Tensor,
     other_fit: Callable[[Tensor], Registration],
 ) -> Registration:
     """The registration, with a note of each eye of the scan that is shut though taken as open, or the other way.
 
-    The scan's face is drawn from the front and the eye network looks at it; where the scan has no colours, or they do
-    not show a face, the template is registered once more with its lids the other way.
+    The eye network looks at a view of the scan; where the scan has no colours, or they do not show a face, the template
+    is registered once more with its lids the other way.
     """
     blinks = mapping(rig.names, _BLINKS) > 0.5
     if not bool(blinks.any(1).all()):
         return registration
     taken = [bool((shown[blink] > 0.5).all()) for blink in blinks]
-    found, how = _by_texture(scan, registration, rig), "the eye network sees"
+    found, how = _by_texture(view), "the eye network sees"
     if found is None:
         found, how = _by_shape(rig, registration, blinks, shown, other_fit, taken), "the lids' shape says"
     shut = [was if saw is None else saw for was, saw in zip(taken, found, strict=True)]
@@ -114,23 +107,12 @@ def with_shut_eyes(rig: BlendshapeRig, shut: tuple[bool, bool]) -> BlendshapeRig
     return BlendshapeRig(rig.neutral.with_vertices(vertices), deltas, rig.names)
 
 
-def _by_texture(scan: Mesh, registration: Registration, rig: BlendshapeRig) -> list[bool | None] | None:
+def _by_texture(view: FrontView | None) -> list[bool | None] | None:
     """Whether each eye is shut in the scan's colours, None where it is between; None where they show no face."""
-    marks = registration.mesh.landmarks if _has_68(registration.mesh) else None
-    false = any("colours are not a face's" in note for note in registration.record.notes)
-    if marks is None or false or not has_colors(scan):
-        return None
-    mesh = registration.mesh.vertices.detach().cpu().double()
-    upright = similarity_transform(mesh[None], rig.neutral.vertices.detach().cpu().double()[None], scale=False)
-    placed = scan.with_vertices(upright.apply(scan.vertices.detach().cpu().double())[0].to(scan.vertices))
-    camera = frame_face(rig.neutral, width=_WIDTH, height=_HEIGHT)
-    picture = (render(placed, camera, samples=1).clamp(0, 1) * 255).round().to(torch.uint8)
-    box = box_around(camera.project(upright.apply(mesh[marks.cpu()])[0]).float())
-    reading = settled_face(load_finder().finder, picture, box, 0.0)
-    if float(reading.presence) < _LEAST_PRESENCE or not bool(torch.isfinite(reading.closed).all()):
+    if view is None or not view.colored or not bool(torch.isfinite(view.reading.closed).all()):
         return None
     sides = [1, 0]  # the network's eyes are iBUG's, the right one first
-    return [True if one > _SHUT else False if one < _OPEN else None for one in reading.closed[sides].tolist()]
+    return [True if one > _SHUT else False if one < _OPEN else None for one in view.reading.closed[sides].tolist()]
 
 
 def _by_shape(
@@ -156,8 +138,3 @@ def _by_shape(
         ratio = float(shut.distance[lids].mean() / open_.distance[lids].mean().clamp(min=1e-6))
         found.append(True if ratio < _BETTER else False if ratio > _WORSE else None)
     return found
-
-
-def _has_68(mesh: Mesh) -> bool:
-    notes = mesh.annotations
-    return notes is not None and notes.landmarks is not None and len(notes.landmarks) == COUNT
