@@ -9,8 +9,7 @@ from torchface.enhancement import EnhancementModel
 from torchface.enhancement.animation_retiming import at_moments, retimed_moments
 from torchface.enhancement.timing.actor_timing import ActorTiming
 from torchface.enhancement.timing.motion_keyframes import find_keyframes
-from torchface.enhancement.timing.nearest_timing import project_sequence
-from torchface.errors import ShapeError, TorchfaceError, ValueRangeError
+from torchface.errors import TorchfaceError, ValueRangeError
 
 
 def test_keyframes_are_kept_exactly(model: EnhancementModel, database: Database) -> None:
@@ -71,5 +70,3 @@ def test_what_has_no_motion_is_refused(model: EnhancementModel, database: Databa
         model.retime(database.smooth[[0, 4]], 1)
     with pytest.raises(ValueRangeError, match="two frames or more"):
         ActorTiming(known, torch.arange(9), torch.ones(1, 4), 30.0)
-    with pytest.raises(ShapeError, match="two frames at least"):
-        project_sequence(torch.zeros(3, 2), torch.zeros(1, 2))

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -14,9 +13,11 @@ from torchface.number_checks import checked_count
 
 NEAREST = 8
 _STILL = 1e-3  # share of the whole motion below which a region counts as at rest
-_STEPS = 128  # blends by which a captured motion's timing is read, at least
 _DRIFT = 0.05  # share of a sequence's range by which an extended motion may go back before it counts as another
 _DETOUR = 0.5  # what a captured way costs that is longer than the straight one, a length of distance
+_WAIT = 1e-6  # of the asked motion's size: what a frame costs, which decides between poses that are equal
+_LITTLE = 0.1  # of the asked motion's size: a captured motion that is smaller may be noise
+_ONE_WAY = 0.5  # of how far a motion goes from its first pose: how far its last pose is at least
 _HOLD = 0.01  # share of the range within which the face counts as held
 
 
@@ -43,7 +44,7 @@ def nearest_timing(
         (frames,), 0 first and 1 last, never falling.
 
     Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6.2. Changed: several motions are
-    averaged, and extending is the default.
+    averaged, extending is the default, and a captured motion is read along the straight way between its ends.
     """
     checked_count("nearest", nearest, 1)
     scale = region.clamp(min=0).sqrt().double()[:, None]
@@ -55,9 +56,10 @@ def nearest_timing(
         path = (sequence.double() * scale).flatten(1)
         times, error = _on_one_motion(pair, path)
         motion = _extended(path, times, pair[1] - pair[0]) if extend else _between(path, times)
-        if len(motion) < 2:
+        # Both poses may lie at one of the sequence's, or at the neutrals at its ends: it has no way between them.
+        leaves = (motion - motion[0]).norm(dim=1)
+        if float(leaves[-1]) <= max(_ONE_WAY * float(leaves.max()), _LITTLE * size):
             continue
-        # Both poses may lie at one of the sequence's: then it says nothing of the way between them.
         missed = (pair[1] - pair[0] - (motion[-1] - motion[0])).norm()
         # Quick motions have another course than slow ones.
         errors.append((error + float(missed)) / size + abs(math.log((len(motion) - 1) / length)))
@@ -99,39 +101,36 @@ def moving_regions(keyframes: Tensor, weights: Tensor) -> Tensor:
 
 
 def motion_progress(motion: Tensor, frames: int) -> Tensor:
-    """How far a captured motion, features (n,D), has come from first to last pose, (frames,), never falling."""
-    if len(motion) == 2:
-        return torch.linspace(0, 1, frames, dtype=torch.float64)
-    count = max(_STEPS, 2 * len(motion))
-    asked = torch.linspace(0, 1, count, dtype=torch.float64)
-    blends = torch.lerp(motion[:1].double(), motion[-1:].double(), asked[:, None])
-    times = project_sequence(blends, motion).times
-    times[0], times[-1] = 0, len(motion) - 1
-    # A jump leaves several blends at one time: the least of slopes keeps them apart.
-    times = (times + 1e-6 * asked) * ((len(motion) - 1) / (len(motion) - 1 + 1e-6))
-    moments = np.linspace(0, len(motion) - 1, frames)
-    progress = torch.from_numpy(np.interp(moments, times.numpy(), asked.numpy()))
-    progress[0], progress[-1] = 0, 1
-    return progress
+    """How far a captured motion, features (n,D), has come from first to last pose, (frames,), never falling.
+
+    Its frames are projected onto the straight way between both poses and put in order by isotonic regression: no step
+    is larger than the captured one. Blends on that way, projected onto the frames, would share frames and jump there.
+    """
+    way = motion[-1] - motion[0]
+    along = isotonic_regression(((motion - motion[0]) @ way).numpy()).x
+    # What goes back before its start or beyond its end: whole once more, without a jump.
+    course = (along - along[0]) / (along[-1] - along[0])
+    progress = np.interp(np.linspace(0, len(motion) - 1, frames), np.arange(len(motion)), course)
+    return torch.from_numpy(progress)
 
 
 def _on_one_motion(pair: Tensor, captured: Tensor) -> tuple[Tensor, float]:
-    """Where two poses (2,D) lie in order on a sequence (n,D), (2,), with little else between them; and what is missed.
+    """Where two poses (2,D) lie in order on a sequence (n,D), (2,), with little else between; how far off they are.
 
     The neutral stands at both ends of a sequence, and an expression is met on the way there and on the way back: by
-    distance alone all four pairings are as good.
+    distance alone all four pairings are as good. Of a hold only the frame next to the motion counts.
     """
     shares, distances = segment_projections(pair, captured)
     steps = (captured[1:] - captured[:-1]).norm(dim=1)
+    moments = torch.arange(len(steps)) + shares
     travelled = torch.cat([steps.new_zeros(1), steps.cumsum(0)])[:-1] + shares * steps
     way = travelled[1] - travelled[0][:, None]
-    detour = (way - (pair[1] - pair[0]).norm()).clamp(min=0)
-    cost = distances[0][:, None] + distances[1] + _DETOUR * detour
-    cost = torch.where(way >= 0, cost, torch.inf)
-    best = int(cost.argmin())
-    first, last = divmod(best, len(steps))
-    times = torch.stack([first + shares[0, first], last + shares[1, last]])
-    return times, float(cost[first, last])
+    size = (pair[1] - pair[0]).norm()
+    waited = _WAIT * size * (moments[1] - moments[0][:, None])
+    cost = distances[0][:, None] + distances[1] + _DETOUR * (way - size).clamp(min=0) + waited
+    first, last = divmod(int(torch.where(way >= 0, cost, torch.inf).argmin()), len(steps))
+    times = torch.stack([moments[0, first], moments[1, last]])
+    return times, float(distances[0, first] + distances[1, last])
 
 
 def _between(captured: Tensor, times: Tensor) -> Tensor:
@@ -162,52 +161,6 @@ def _turning(values: Tensor, extent: float) -> int:
     risen = (values - least > _DRIFT * extent).nonzero()[:, 0]
     end = int(risen[0]) if len(risen) else len(values) - 1
     return int((values <= least[end] + _HOLD * extent).nonzero()[0, 0])
-
-
-@dataclass(frozen=True, eq=False)
-class SequenceProjection:
-    """Where the frames of one sequence lie on another."""
-
-    times: Tensor  # on the other's timeline, from 0 to its number of frames minus 1, never falling, (m,)
-    distances: Tensor  # from the points at those times, (m,)
-
-
-def project_sequence(alpha: Tensor, beta: Tensor) -> SequenceProjection:
-    r"""Projects a sequence (m,D) onto another (n,D), of two frames at least, in order.
-
-    Each frame is projected onto each segment; the path that never goes back and has the least sum of distances is
-    found by dynamic programming. Frames that share a segment are put in order by isotonic regression.
-
-    .. math:: \min_P \sum_i E_{i,P(i)}, \quad P(i) \le P(i+1)
-
-    Source: Facial Performance Enhancement Using Dynamic Shape Space Analysis, section 6.1, equations 5 and 6. Changed:
-    order is held inside segments too.
-    """
-    if alpha.ndim != 2 or beta.ndim != 2 or alpha.shape[1] != beta.shape[1] or len(beta) < 2 or len(alpha) < 1:
-        raise ShapeError(
-            f"project_sequence: found alpha {tuple(alpha.shape)} and beta {tuple(beta.shape)}, expected (m,D) and "
-            "(n,D) with a frame and two frames at least"
-        )
-    alpha, beta = alpha.double(), beta.double()
-    shares, distances = segment_projections(alpha, beta)
-    best, came_from = distances[0], []
-    # A frame's best cost needs the frame's before: one step a frame.
-    for row in distances[1:]:
-        least, where = best.cummin(0)
-        came_from.append(where)
-        best = least + row
-    path = [int(best.argmin())]
-    for where in reversed(came_from):
-        path.append(int(where[path[-1]]))
-    segments = torch.tensor(path[::-1])
-    frames = torch.arange(len(alpha))
-    inside = shares[frames, segments]
-    for segment in segments.unique():  # runs differ in length
-        run = segments == segment
-        inside[run] = torch.from_numpy(isotonic_regression(inside[run].numpy()).x)
-    step = beta[segments + 1] - beta[segments]
-    nearest = beta[segments] + inside[:, None] * step
-    return SequenceProjection(segments + inside, (alpha - nearest).norm(dim=1))
 
 
 def segment_projections(alpha: Tensor, beta: Tensor) -> tuple[Tensor, Tensor]:
