@@ -26,12 +26,7 @@ import torch
 from real_faces import clips
 from torch import Tensor
 
-from planted.portrait_video import (
-    EXPRESSIONS,
-    expression_weights,
-    mixed_expressions,
-    render_portrait_video,
-)
+from planted.portrait_video import EXPRESSIONS, expression_weights, mixed_expressions, render_portrait_video
 from torchface import zoo
 from torchface.landmarks import AppearanceModel, AppearanceSettings
 from torchface.landmarks.images.appearance.shape_modes import planar_pose

@@ -13,20 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from image_fit_cases import (
-    FOCAL,
-    HEADING,
-    HEADS,
-    SIZE,
-    SPREAD,
-    Capture,
-    Faces,
-    Row,
-    alternate,
-    lip_gap,
-    planted,
-    table,
-)
+from image_fit_cases import FOCAL, HEADING, HEADS, SIZE, SPREAD, Capture, Faces, Row, alternate, lip_gap, planted, table
 from torch import Tensor
 
 from planted.photographed_heads import aligned_error

@@ -10,14 +10,7 @@ from typing import Any
 
 import pytest
 import torch
-from module_examples import (
-    EXAMPLES,
-    NAMES,
-    Example,
-    corrected_rig,
-    corrected_solver,
-    seen_markers,
-)
+from module_examples import EXAMPLES, NAMES, Example, corrected_rig, corrected_solver, seen_markers
 from pretended_device import pretended
 from torch import Tensor, nn
 from torch.utils._pytree import tree_leaves

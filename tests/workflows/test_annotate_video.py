@@ -7,12 +7,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from planted.portrait_video import (
-    EXPRESSIONS,
-    PortraitVideo,
-    expression_weights,
-    render_portrait_video,
-)
+from planted.portrait_video import EXPRESSIONS, PortraitVideo, expression_weights, render_portrait_video
 from torchface import zoo
 from torchface.cli import main
 from torchface.errors import FileFormatError, ShapeError, TorchfaceError, ValueRangeError

@@ -8,16 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from image_bytes import (
-    PNG_START,
-    jpeg_segment,
-    png,
-    png_chunk,
-    png_header,
-    tiff,
-    webp,
-    webp_canvas,
-)
+from image_bytes import PNG_START, jpeg_segment, png, png_chunk, png_header, tiff, webp, webp_canvas
 from PIL import Image
 from reader_budget import check_budget
 

@@ -10,12 +10,7 @@ from torchface.io.action_labels import load_action_labels
 from torchface.io.video import open_video
 from torchface.synthetic import performer
 from train.filmed_performers.action_performance import ACTION_UNITS, MOVES
-from train.filmed_performers.camera_stage import (
-    SIDE_MARKERS,
-    RecordedSession,
-    render_video,
-    stage_markers,
-)
+from train.filmed_performers.camera_stage import SIDE_MARKERS, RecordedSession, render_video, stage_markers
 from train.filmed_performers.head_camera_images import HeadCameraRenderer
 from train.filmed_performers.helmet_camera import HELMET_POINT, CameraFlaws, helmet_camera, shaken_cameras
 from train.filmed_performers.reflective_paint import reflective_paint
