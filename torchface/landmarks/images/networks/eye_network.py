@@ -1,13 +1,12 @@
 """An eye in one pass of a small convolutional network: lids, iris, how sure each is, and how far it is open."""
 
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.files.documents import Value
 from torchface.landmarks.images.networks.eye_crop import CROP_HEIGHT, CROP_WIDTH
 from torchface.landmarks.images.networks.heat_maps import ResidualBlock, convolution, doubled, read_heat
 from torchface.landmarks.images.networks.picture_network import PictureNetwork
@@ -110,21 +109,6 @@ class EyeNetwork(PictureNetwork):
         from torchface.landmarks.images.networks.eye_training import eye_task
 
         return eye_task(self, pictures, settings, device)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        return {
-            "width": self.width, "height": self.height, "channels": list(self.channels), "blocks": list(self.blocks),
-            "hidden": self.hidden,
-        }  # fmt: skip
-
-    @classmethod
-    def from_config(cls, config: dict[str, Any]) -> Self:
-        given = Value("config", "", config).table()
-        return cls(
-            given["width"].whole(), given["height"].whole(), tuple(one.whole() for one in given["channels"].rows()),
-            tuple(one.whole() for one in given["blocks"].rows()), given["hidden"].whole(),
-        )  # fmt: skip
 
     def forward(self, crops: Tensor) -> EyeFindings:
         """What crops show, (B,3,h,w) in [0,1], red first.

@@ -1,13 +1,12 @@
 """Landmarks of a face in one pass of a small convolutional network, and with a head for it points of the whole face."""
 
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.files.documents import Value
 from torchface.landmarks.images.ibug_68 import COUNT
 from torchface.landmarks.images.networks.dense_head import WEIGHTS, DenseHead, DenseReading
 from torchface.landmarks.images.networks.heat_maps import ResidualBlock, convolution, doubled, read_heat
@@ -145,22 +144,6 @@ class LandmarkNetwork(PictureNetwork):
         from torchface.landmarks.images.networks.landmark_training import landmark_task
 
         return landmark_task(self, pictures, settings, device)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        return {
-            "size": self.size, "margin": self.margin, "channels": list(self.channels), "blocks": list(self.blocks),
-            "decoder": self.decoder, "points": self.points, "hidden": self.hidden,
-        }  # fmt: skip
-
-    @classmethod
-    def from_config(cls, config: dict[str, Any]) -> Self:
-        given = Value("config", "", {"points": 0, "hidden": 176} | config).table()
-        return cls(
-            given["size"].whole(), given["margin"].number(), tuple(one.whole() for one in given["channels"].rows()),
-            tuple(one.whole() for one in given["blocks"].rows()), given["decoder"].whole(),
-            given["points"].whole(), given["hidden"].whole(),
-        )  # fmt: skip
 
     @property
     def places(self) -> Tensor:

@@ -1,6 +1,6 @@
 """Parts of a face in a picture by a small convolutional network: skin, hair, brows, eyes, glasses, hands, cloth."""
 
-from typing import Any, Self
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -8,7 +8,6 @@ from torch.nn.functional import interpolate, pixel_shuffle
 from torch.utils.data import Dataset
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.files.documents import Value
 from torchface.landmarks.images.networks.eye_network import evened
 from torchface.landmarks.images.networks.heat_maps import convolution
 from torchface.landmarks.images.networks.picture_network import PictureNetwork
@@ -75,15 +74,6 @@ class PartNetwork(PictureNetwork):
         from torchface.landmarks.images.networks.part_training import part_task
 
         return part_task(self, pictures, settings, device)
-
-    @property
-    def config(self) -> dict[str, Any]:
-        return {"channels": list(self.channels), "blocks": list(self.blocks)}
-
-    @classmethod
-    def from_config(cls, config: dict[str, Any]) -> Self:
-        given = Value("config", "", config).table()
-        return cls(*(tuple(one.whole() for one in given[name].rows()) for name in ("channels", "blocks")))
 
     def forward(self, crops: Tensor) -> Tensor:
         """Shares (B,10,H,W) of the parts in crops (B,3,H,W) in [0,1], red first; it has learned from 128 x 128."""

@@ -1,5 +1,6 @@
-"""Base of the networks that learn from pictures of faces: how they are trained."""
+"""Base of the networks that learn from pictures of faces: how they are trained, and built from what files hold."""
 
+import inspect
 from abc import abstractmethod
 from pathlib import Path
 from typing import Any, Self
@@ -8,6 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.utils.data import Dataset
 
+from torchface.files.documents import Value
 from torchface.optim import DescentRun, DescentSettings, DescentTask, descend
 from torchface.progress import Progress, ValueLog, silent
 
@@ -46,6 +48,27 @@ class PictureNetwork(nn.Module):
         with torch.random.fork_rng([]):
             torch.manual_seed(seed)
             return cls()
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """What the constructor was given: whole numbers, numbers, or several whole ones."""
+        given = {name: getattr(self, name) for name in inspect.signature(type(self)).parameters}
+        return {name: list(value) if isinstance(value, tuple) else value for name, value in given.items()}
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any]) -> Self:
+        """A network for the state to be loaded into; what a config of an earlier version lacks is as usual."""
+        usual = {name: one.default for name, one in inspect.signature(cls).parameters.items()}
+        given = Value("config", "", config).table()
+        read = {
+            name: tuple(one.whole() for one in given[name].rows())
+            if isinstance(usual[name], tuple)
+            else given[name].number()
+            if isinstance(usual[name], float)
+            else given[name].whole()
+            for name in usual.keys() & given.keys()
+        }
+        return cls(**read)
 
     @classmethod
     @abstractmethod
