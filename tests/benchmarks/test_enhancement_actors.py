@@ -4,12 +4,12 @@ from pathlib import Path
 
 import pytest
 import torch
+from enhancement_comparison import fitted
 from enhancement_measures import Ruler
 from enhancement_peers import Method
-from enhancement_scenes import FPS, Scene, scene_of
+from enhancement_scenes import Scene, scene_of
 from torch import Tensor
 
-from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.enhancement.detail.low_pass import LowPass
 from torchface.synthetic import IDENTITY, performer
 from torchface.synthetic.stages.wrinkles import WrinkledPerformer
@@ -30,20 +30,6 @@ def actors(data: Path, seed: int) -> tuple[Scene, Scene]:
     return scene_of("giver", giver, data, FRAMES), scene_of("taker", taker, data, FRAMES)
 
 
-def fitted(scene: Scene, pairs: bool) -> EnhancementModel:
-    return EnhancementModel.fit(
-        CapturedPerformance(
-            scene.frames,
-            scene.faces,
-            scene.sequences,
-            scene.neutral,
-            coarse=scene.rigged if pairs else None,
-            landmarks=scene.performer.neutral.landmarks,
-        ),
-        EnhancementSettings(fps=FPS),
-    )
-
-
 @pytest.mark.parametrize(("seed", "places"), [(0, "in the same places"), (1, "elsewhere")])
 def test_another_actors_detail(data: Path, seed: int, places: str) -> None:
     """Where wrinkles run alike his are nearer to the own ones than none; elsewhere they are as many, not the same."""
@@ -54,7 +40,10 @@ def test_another_actors_detail(data: Path, seed: int, places: str) -> None:
           f"wrinkles {places}: fine part and normals as shares of the smooth input's, and how much is added as a share "
           "of what the truth adds to the coarse animation")  # fmt: skip
     print(" " * 40 + "".join(f"{f'wrinkles x {s:g}':>30s}" for s in (1.0, WEAKER)))
-    models = {", from pairs" if pairs else "": (fitted(giver, pairs), fitted(taker, pairs)) for pairs in (False, True)}
+    models = {
+        kind: tuple(fitted(scene, scene.rigged if kind else None) for scene in (giver, taker))
+        for kind in ("", ", from pairs")
+    }
     found: dict[str, list[float]] = {}
     for scale in (1.0, WEAKER):
         ways: dict[str, Method] = {"coarse animation itself": lambda coarse: coarse}

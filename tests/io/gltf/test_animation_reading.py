@@ -37,18 +37,6 @@ def test_weights_and_rate_come_back(fps: float, tmp_path: Path) -> None:
     assert torch.equal(found.weights.values, weights)
 
 
-def test_uneven_frames_come_back_at_their_times(tmp_path: Path) -> None:
-    rig, seconds = sheet_rig(), torch.tensor([0.0, 0.033, 0.067, 0.2, 0.234, 0.266])
-    weights = torch.rand(6, len(rig.names), 1, generator=torch.Generator().manual_seed(0))
-    save_animation(rig, Take(30.0, weights=Track(rig.names, weights), seconds=seconds), tmp_path / "take.glb")
-    found = read_gltf_weights(tmp_path / "take.glb")
-    assert found.fps == pytest.approx(4 / 0.133, rel=1e-4)  # without the gap
-    torch.testing.assert_close(found.seconds, seconds.double(), atol=1e-6, rtol=0)
-    save_animation(rig, found, tmp_path / "again.glb")
-    again = read_gltf_weights(tmp_path / "again.glb")
-    torch.testing.assert_close(again.seconds, found.seconds)
-
-
 def test_the_first_animation_that_moves_shapes_is_the_take(tmp_path: Path) -> None:
     save_animation(sheet_rig(), sheet_take(), tmp_path / "take.glb")
     expected = read_gltf_weights(tmp_path / "take.glb")

@@ -94,15 +94,6 @@ def test_weights_and_rate_come_back(fps: float, tmp_path: Path) -> None:
     assert torch.equal(found.weights.values, weights)
 
 
-def test_uneven_frames_come_back_at_their_times(tmp_path: Path) -> None:
-    rig, seconds = sheet_rig(), torch.tensor([0.0, 0.033, 0.067, 0.2, 0.234, 0.266])
-    weights = torch.rand(6, len(rig.names), 1, generator=torch.Generator().manual_seed(0))
-    take = Take(30.0, weights=Track(rig.names, weights), seconds=seconds)
-    save_animation(rig, take, tmp_path / "take.usdc")
-    found = load_animation(tmp_path / "take.usdc")
-    assert (found.seconds - seconds).abs().max() < 1e-6
-
-
 def test_correctives_come_back_in_betweens_as_usds_own(tmp_path: Path) -> None:
     rig = corrective_sheet()
     take = Take(24.0, weights=Track(rig.names, torch.rand(4, 3, 1, generator=torch.Generator().manual_seed(2))))
