@@ -70,9 +70,9 @@ def annotate(
                 return tracked.values, tracked.confidence
 
             progress("reading")
-            finder = None if is_table(landmarks) else load_finder(landmarks)
+            finder = None if is_table(landmarks) else load_finder(landmarks, "film")
             source = Path(landmarks) if finder is None else finder.source
-            key = content_key("annotate", landmarks=source, face=face)
+            key = content_key("annotate/2", landmarks=source, face=face)
             annotation = prepare_annotation(video, out, track, count, key)
         if not browser:
             for path in write_proposals(annotation):

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
@@ -33,6 +33,7 @@ __all__ = ["NamedFinder", "load_finder"]
 DEFAULT_LANDMARKS = "landmark_network"  # the model of the zoo that finds landmarks where none is named
 EYES = "eye_network"  # the model of the zoo that reads eyes
 PARTS = "face_parts"  # the model of the zoo that says which part of a face each pixel shows
+Shown = Literal["live", "film", "photograph"]
 BUNDLE = ".task"  # the ending of MediaPipe's Face Landmarker bundles
 
 
@@ -54,7 +55,7 @@ class NamedFinder:
 
 
 def load_finder(
-    name_or_path: str | Path = DEFAULT_LANDMARKS, photographs: bool = False, option: str = "--landmarks"
+    name_or_path: str | Path = DEFAULT_LANDMARKS, shown: Shown = "live", option: str = "--landmarks"
 ) -> NamedFinder:
     """A finder of landmarks.
 
@@ -62,7 +63,8 @@ def load_finder(
         name_or_path: a model of the zoo by name or folder, see ``zoo.get_model``; an ``.onnx`` file, see
             :func:`~torchface.landmarks.images.networks.onnx_finder.onnx_finder`; or MediaPipe's Face Landmarker
             bundle, ``.task``.
-        photographs: take the time that a single picture is worth.
+        shown: what it is for. A network is shown the mirror image of faces in films and photographs too, trees take for
+            a photograph the time that a single picture is worth.
         option: of the command that gives the name, for messages.
 
     Raises:
@@ -83,24 +85,24 @@ def load_finder(
         return NamedFinder(onnx_finder(name_or_path), Path(name_or_path))
     model = zoo.get_model(name_or_path)
     if isinstance(model, LandmarkNetwork):
-        finder = network_finder(model, str(name_or_path), photographs)
+        finder = network_finder(model, str(name_or_path), shown != "live")
         return NamedFinder(finder, zoo.find(name_or_path), model.places, model.points > 0)
     if not isinstance(model, LandmarkTrees):
         raise NameMismatchError(
             f"{option}: found {name_or_path}, a {type(model).__name__}, expected a LandmarkTrees or LandmarkNetwork"
         )
-    starts = PHOTOGRAPH if photographs else ConsensusSettings()
+    starts = PHOTOGRAPH if shown == "photograph" else ConsensusSettings()
     try:
         return NamedFinder(TreeFinder(model, starts, str(name_or_path)), zoo.find(name_or_path))
     except ValueRangeError as error:
         raise ValueRangeError(f"{name_or_path}: {error}") from error
 
 
-def network_finder(network: LandmarkNetwork, name: str, photographs: bool = False) -> EyedFinder:
+def network_finder(network: LandmarkNetwork, name: str, both_sides: bool = False) -> EyedFinder:
     """A finder that runs a landmark network, and on the eyes that it finds the zoo's eye network, in ONNX Runtime:
-    in a third of PyTorch's time for single crops. For ``photographs`` it is shown each crop's mirror image too."""
+    in a third of PyTorch's time for single crops. With ``both_sides`` it is shown each crop's mirror image too."""
     finder = graph_finder(_graph(network), Path(name))
-    if photographs:
+    if both_sides:
         finder = replace(finder, network=BothSides(finder.network, network.mirror))
     return EyedFinder(finder, eye_finder())
 

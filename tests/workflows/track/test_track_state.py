@@ -24,7 +24,7 @@ def test_a_killed_run_goes_on_where_it_was_and_gives_the_same(done: Done, filmed
     assert done.left == (FOLDER,)
     assert done.steps == FRAMES - 2 * PIECE
     assert done.tracked.reused == 2 * PIECE
-    tracker = LandmarkTracker(load_finder().finder, detector=graph_detector())
+    tracker = LandmarkTracker(load_finder(shown="film").finder, detector=graph_detector())
     whole: list[torch.Tensor] = []
     whole.extend(tracker.step(frame).landmarks for frame in open_video(filmed.video).color_frames())
     assert torch.equal(done.tracked.reading.landmarks, torch.stack(whole))

@@ -148,7 +148,7 @@ def _landmarks(clip: VideoFile | None, landmarks: str, face: int, progress: Prog
         return take
     if clip is None:
         raise ValueRangeError("track: found neither VIDEO nor a .csv of landmarks, expected one")
-    named = load_finder(landmarks)
+    named = load_finder(landmarks, "film")
     tracker = LandmarkTracker(named.finder, face=face, fps=clip.fps)
     return Take(clip.fps, landmarks=track_landmarks(clip, tracker, progress))
 

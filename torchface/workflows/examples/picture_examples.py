@@ -29,7 +29,7 @@ def picture_examples(
     """
     files = _files(pictures)
     names = _names(files)
-    finder = load_finder(landmarks, photographs=True).finder
+    finder = load_finder(landmarks, shown="photograph").finder
     faces, sides = [], []
     for number, (path, name) in enumerate(zip(files, names, strict=True)):  # pictures differ in size
         progress("finding landmarks", number, len(files))

@@ -189,7 +189,7 @@ def find_in_photographs(
     face: int | None = None,
 ) -> list[PhotographLandmarks]:
     """Finds one face in each photograph (3,H,W), the largest, or which of them by number, the largest first."""
-    named = load_finder(model, photographs=True, option="landmark model")
+    named = load_finder(model, shown="photograph", option="landmark model")
     finder = named.finder
     readings = []
     for path, image in zip(photographs, images, strict=True):  # one photograph at a time: they differ in size

@@ -58,7 +58,7 @@ def load_track_models(
     Landmarks may also be a table, ``prior`` "none"; the one by default is left out where it has learned less than half
     of the rig's shapes.
     """
-    named = None if is_table(landmarks) else load_finder(landmarks)
+    named = None if is_table(landmarks) else load_finder(landmarks, "film")
     priors = load_priors(rig, prior, dynamics, fps)
     learned = None if priors.shapes is None else model_folder(prior)
     return TrackModels(
@@ -68,7 +68,9 @@ def load_track_models(
         priors.dynamics,
         priors.unlearned,
         content_key(
-            "seeing", finder=Path(landmarks) if named is None else named.source, appearance=model_folder(appearance)
+            "seeing both sides",
+            finder=Path(landmarks) if named is None else named.source,
+            appearance=model_folder(appearance),
         ),
         content_key("solving", prior=learned, dynamics=model_folder(dynamics), fps=fps),
         named is not None and named.expects and prior == DEFAULT_PRIOR and knows_half(ARKIT, rig),

@@ -152,7 +152,7 @@ def test_a_finder_runs_the_network_of_a_folder(network: LandmarkNetwork, tmp_pat
 
 @pytest.mark.real
 def test_the_shipped_network_finds_photographed_faces(data: Path) -> None:
-    finder, errors, visible = load_finder(photographs=True).finder, [], []
+    finder, errors, visible = load_finder(shown="photograph").finder, [], []
     for path in sorted((data / "images" / "people").glob("*.pts")):
         (image,) = (one for one in path.parent.glob(f"{path.stem}.*") if one.suffix != ".pts")
         truth = load_landmark_points(path).points.float()
