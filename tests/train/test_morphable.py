@@ -1,5 +1,6 @@
 """The recipe end to end: performers, registered meshes in any place and light, a killed run, bad input."""
 
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from planted.published_heads import gnm_arrays, gnm_landmarks, head
 from torchface import Mesh, load_mesh, save_mesh, zoo
 from torchface.color_space import to_linear, to_srgb
-from torchface.errors import TopologyError, TorchfaceError, ValueRangeError
+from torchface.errors import AlignmentError, TopologyError, TorchfaceError, ValueRangeError
 from torchface.geometry.similarity import similarity_transform
 from torchface.io import load_identity_modes
 from torchface.modeling import HeadModel, MorphableModel
@@ -185,6 +186,35 @@ def test_meshes_that_teach_nothing_are_named(heads: list[Mesh], tmp_path: Path, 
         train(settings)
     with pytest.raises(TorchfaceError, match="and a number of performers"):
         train(replace(settings, performers=5))
+
+
+def test_a_mirrored_head_and_another_order_are_refused_and_a_far_one_is_named(
+    heads: list[Mesh], tmp_path: Path, without_pictures: None
+) -> None:
+    scans, settings = tmp_path / "scans", Settings(scans=tmp_path / "scans", out=tmp_path / "model", held_out=1)
+    scans.mkdir()
+    for number, mesh in enumerate(heads[:6]):
+        save_mesh(mesh, scans / f"{number}.glb")
+    save_mesh(heads[3].with_vertices(heads[3].vertices * torch.tensor([-1.0, 1.0, 1.0])), scans / "3.glb")
+    with pytest.raises(AlignmentError, match=r"3\.glb: found a mirror image of 0\.glb's"):
+        train(settings)
+    order = torch.randperm(len(heads[3].vertices), generator=torch.Generator().manual_seed(0))
+    save_mesh(Mesh(heads[3].vertices[order], order.argsort()[heads[3].faces]), scans / "3.glb")
+    with pytest.raises(
+        TopologyError, match=r"3\.glb: found .* other triangles than 0\.glb, or the same in another order"
+    ):
+        train(settings)
+    save_mesh(Mesh(heads[3].vertices[order], heads[3].faces), scans / "3.glb")
+    with pytest.raises(AlignmentError, match=r"3\.glb: found .* vertices stand in another order than 0\.glb's"):
+        train(settings)
+    for number in (3, 5):  # the last is kept for the test
+        save_mesh(heads[number].with_vertices(1.3 * heads[number].vertices), scans / f"{number}.glb")
+        with pytest.warns(UserWarning, match=rf"1 of 6 heads lie far from every other one .*: {number}\.glb \d+ mm"):
+            train(settings)
+        save_mesh(heads[number], scans / f"{number}.glb")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        train(settings)
 
 
 def test_meshes_without_colours_make_a_model_of_shape(

@@ -28,14 +28,16 @@ def as_it_is(template: Mesh, head: Mesh) -> Registration:
     return Registration(mesh, pose, torch.zeros(len(head.vertices)).double(), known, record)
 
 
-def check_own_topology(source: Mesh, target: Mesh, name: str = "neutral") -> None:
+def check_own_topology(source: Mesh, target: Mesh, name: str = "neutral", owner: str = "the template") -> None:
     """Refuses a target that has the source's triangles on other points."""
     used = source.faces.cpu().unique()
     rest, goal = (mesh.vertices.detach().cpu().double()[used] for mesh in (source, target))
     size, beside = extent(goal), extent(rest)
     if size == 0 or beside == 0:
         return  # the solve says it
-    check_unit(name, goal, beside, "the template", _LEAST_EXTENT, _MOST_EXTENT)
-    check_same_hand(rest, goal, name)
+    check_unit(name, goal, beside, owner, _LEAST_EXTENT, _MOST_EXTENT)
+    check_same_hand(rest, goal, name, owner)
     own, found = (mesh.vertices.detach().cpu().double() for mesh in (source, target))
-    check_vertex_order(name, own, similarity_transform(goal[None], rest[None]).apply(found)[0], source.faces.cpu())
+    check_vertex_order(
+        name, own, similarity_transform(goal[None], rest[None]).apply(found)[0], source.faces.cpu(), owner
+    )

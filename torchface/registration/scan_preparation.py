@@ -105,12 +105,12 @@ def _inside_out(scan: PreparedScan) -> bool:
     return float((cross * (centres - mean)).sum()) < 0
 
 
-def check_same_hand(own: Tensor, points: Tensor, name: str = "landmarks") -> None:
+def check_same_hand(own: Tensor, points: Tensor, name: str = "landmarks", owner: str = "the template") -> None:
     """Raises ``AlignmentError`` where points on a scan, or its vertices, (L,3), are a mirror image of a template's."""
     mirrored = check_mirrored(own, points)
     if mirrored.mirrored:
         raise AlignmentError(
-            f"{name}: found a mirror image of the template's: {mirrored.figures()} are left; the scan was exported in "
+            f"{name}: found a mirror image of {owner}'s: {mirrored.figures()} are left; the scan was exported in "
             "left-handed axes (export it in right-handed ones, or negate one coordinate of its vertices and "
             "landmarks), or left and right are swapped"
         )

@@ -21,7 +21,7 @@ _STRETCHES, _LEAST_STRETCH = 32, 150  # that the vertices' numbers are cut into;
 _FOUND_SHIFTS = 16  # longer ones, which most vertices' nearest vertices of the template give
 _SHORTEST = 1e-3  # of the template's extent: shorter edges count as so long
 _LEAST_DIFFERENCE, _WORST = 0.2, 3.0  # of an edge's length: a smooth surface shifted by a row differs by less
-_KEEP_ORDER = "export it with the order kept (Maya, ZBrush and Blender have a setting for it)"
+KEEP_ORDER = "export it with the order kept (Maya, ZBrush and Blender have a setting for it)"
 
 
 def check_vertex_order(name: str, rest: Tensor, goal: Tensor, faces: Tensor, other: str = "the template") -> None:
@@ -34,11 +34,11 @@ def check_vertex_order(name: str, rest: Tensor, goal: Tensor, faces: Tensor, oth
     )
     share = float((there > _TORN * lengths)[lengths > 0].double().mean())
     if share > _TORN_LEAST and (shift := _shift(rest, goal, ends, across, other)):
-        raise AlignmentError(f"{name}: found {shift}; {_KEEP_ORDER}")
+        raise AlignmentError(f"{name}: found {shift}; {KEEP_ORDER}")
     if share > _TORN_SHARE:
         raise AlignmentError(
             f"{name}: found {100 * share:.1f} % of its edges more than {_TORN:g} times as long as {other}'s (both "
-            f"in one size), as where vertices stand in another order than {other}'s; {_KEEP_ORDER}"
+            f"in one size), as where vertices stand in another order than {other}'s; {KEEP_ORDER}"
         )
 
 
