@@ -19,7 +19,7 @@ export class CameraEngine {
   #loadingWords = "";
 
   /**
-   * @param {object} page `{controls(), show(solved), running(on), status(words), problem(words), takesChanged()}`.
+   * @param {object} page `{controls(), show(solved), running(on), status(words), loading(words), problem(words), takesChanged()}`.
    * @param {HTMLVideoElement} video where the camera is shown.
    */
   constructor(page, video) {
@@ -89,6 +89,7 @@ export class CameraEngine {
   #tell(parts = 0, bytes = 0) {
     if (parts || bytes || !this.#loadingWords) this.#loadingWords = `Loading the face reader: ${(bytes / 1e6).toFixed(1)} MB are here, ${parts} of ${PARTS} steps are done…`;
     if (this.running) this.#page.status(this.#loadingWords);
+    else this.#page.loading(this.#loadingWords);
   }
 
   /** The solver, which is loaded once; after a failure once more. */
@@ -96,8 +97,10 @@ export class CameraEngine {
     this.#loading ??= (this.#solver = new Solver((...here) => this.#tell(...here))).load("./webcam.graph");
     try {
       await this.#loading;
+      this.#page.loading("");
     } catch (error) {
       this.#forget();
+      this.#page.loading("");
       throw new Error(`The solver could not be loaded: ${error.message}.`);
     }
   }

@@ -44,14 +44,20 @@ export function offerCharacters(use, useTake) {
  *
  * @param {(character: object) => void} use is given it.
  * @param {boolean} remembered whether one that was chosen before comes first.
+ * @param {(bytes: number, all: boolean) => void} tell is told how much is here, and at last that it is all.
  */
-export async function shippedCharacter(use, remembered = true) {
+export async function shippedCharacter(use, remembered = true, tell = () => {}) {
   const kept = remembered ? await keptFile(KEY).catch(() => null) : null;
+  if (kept) tell(kept.size, true);
   if (kept && (await taken(kept, use, null, false))) return;
   const [answer, shapes] = await Promise.all([fetch("./character.glb"), fetch("./character.json")]);
   if (!answer.ok) return showProblem("character", "character.glb is not beside this page; choose one of your own.");
   const { name, sources } = shapes.ok ? await shapes.json() : { name: "character.glb", sources: null };
-  await taken(new File([await answer.blob()], name), use, sources, false);
+  let bytes = 0;
+  const counted = new TransformStream({ transform: (part, to) => (tell((bytes += part.length), false), to.enqueue(part)) });
+  const content = await new Response(answer.body.pipeThrough(counted)).blob();
+  tell(bytes, true);
+  await taken(new File([content], name), use, sources, false);
 }
 
 async function taken(file, use, sources, keep) {

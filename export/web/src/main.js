@@ -16,7 +16,7 @@ import { StateWords, isSeen } from "./state_words.js";
 import { isStream, layOutStream } from "./stream_view.js";
 import { TakeList } from "./take_list.js";
 import { shapeSettings, WeightControls } from "./weight_controls.js";
-import { hideProblem, showNotes, showProblem, showStatus, speak } from "./words.js";
+import { hideProblem, showLoading, showNotes, showProblem, showStatus, speak } from "./words.js";
 
 const NEUTRAL = { ...shapeSettings({}), centre: null, frozen: false };
 const element = (id) => document.getElementById(id);
@@ -25,10 +25,14 @@ const INVITATION = server ? "" : "Start the camera to begin.";
 const rate = new FrameRate(), words = new StateWords();
 let character = null, stage = null, calibration = null;
 let newest = null; // as it was solved, before what the user set
-let frozen = false, said = "", noted = "";
+let frozen = false, said = "", noted = "", loading = "";
 let weights = null; // what the user set of weights
 
 const mirrored = (stream ? layOutStream() : null) ?? settings.mirror;
+
+function invite() {
+  showStatus(said || loading || INVITATION);
+}
 
 function collect() {
   weights = calibration ? NEUTRAL : { ...shapeSettings(settings.groups, settings.gains), centre: settings.centre, frozen };
@@ -62,15 +66,20 @@ const page = {
     takes.stop();
     rate.forget();
     drawFace(element("overlay"), null);
-    showStatus(said || INVITATION);
+    invite();
   },
   status: showStatus,
+  /** What of the engine is on its way while the camera is off. */
+  loading(words) {
+    loading = words;
+    if (!engine.running) invite();
+  },
   problem: (what) => showProblem("camera", what),
   takesChanged: () => takes.refresh(),
   /** What torchface says of itself, beside the frames. */
   state({ words: told = "", notes = [], ended = "", calibrate = false }) {
     said = ended || told;
-    if (ended || !engine.running) showStatus(said || INVITATION);
+    if (ended || !engine.running) invite();
     if (notes.join("\n") !== noted) showNotes(notes); // else what this page has noted since would go
     noted = notes.join("\n");
     if (calibrate && calibration === null && !stream) startCalibration();
@@ -78,7 +87,6 @@ const page = {
 };
 
 const engine = server ? new ServerEngine(page, element("picture")) : new CameraEngine(page, element("video"));
-if (!server && !stream) engine.prepare(); // first: drawing takes a while to begin
 const playing = new WeightControls();
 const takes = new TakeList(engine.takes, () => character, (frame) => stage?.pose(playing.apply(frame, NEUTRAL)));
 
@@ -211,6 +219,7 @@ try {
   stage = new Stage(element("character"));
 } catch {
   element("undrawn").hidden = false;
+  showLoading("");
 }
 const use = (chosen) => {
   character = chosen;
@@ -222,7 +231,22 @@ const use = (chosen) => {
   engine.nameShapes?.(element("own").hidden ? changedNames(chosen.name) : {});
 };
 if (!stream) offerCharacters(use, (file) => takes.take(file));
-shippedCharacter(use).catch((error) => showProblem("character", `The character could not be loaded: ${error.message}.`));
+element("character").addEventListener("drawn", () => showLoading(""));
+let prepared = server || stream;
+/** Begins to load the engine, once the character is here: on a slow line it would be seen much later otherwise. */
+function prepare() {
+  if (!prepared) engine.prepare();
+  prepared = true;
+}
+shippedCharacter(use, true, (bytes, all) => {
+  if (stage !== null) showLoading(all ? "Preparing the character…" : `Loading the character: ${(bytes / 1e6).toFixed(1)} MB are here…`);
+  if (all) prepare();
+})
+  .catch((error) => showProblem("character", `The character could not be loaded: ${error.message}.`))
+  .finally(() => {
+    prepare();
+    if (character === null) showLoading("");
+  });
 takes.refresh();
 if (server || stream) engine.start();
-else showStatus(INVITATION);
+else invite();

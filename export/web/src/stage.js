@@ -21,9 +21,12 @@ export class Stage {
   #pace = new DrawingPace(1);
   #asked = false;
   #drawing = false;
+  #hasDrawn = false;
   #film;
 
   /**
+   * The canvas has an event `drawn` when the first picture of a character is there.
+   *
    * @param {HTMLCanvasElement} canvas whose size the page's layout says; throws where there is no WebGL.
    * @param {{width: number, height: number, background: string} | null} film of one that is drawn for a film, by `drawNow`.
    */
@@ -92,6 +95,10 @@ export class Stage {
     if (this.#renderer.getPixelRatio() !== this.#pace.ratio) this.#renderer.setPixelRatio(this.#pace.ratio);
     this.drawNow();
     await drawn(this.#renderer.getContext());
+    if (!this.#hasDrawn && this.#character !== null) {
+      this.#hasDrawn = true;
+      this.#renderer.domElement.dispatchEvent(new Event("drawn"));
+    }
     return performance.now() - began;
   }
 

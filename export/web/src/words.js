@@ -18,6 +18,12 @@ export function showStatus(words) {
   if (element("status").textContent !== words) element("status").textContent = words;
 }
 
+/** What of the character is on its way, in its place; nothing once it is there. */
+export function showLoading(words) {
+  element("loading").textContent = words;
+  element("loading").hidden = words === "";
+}
+
 export function showCharacterLine(words) {
   element("character-line").textContent = words;
 }

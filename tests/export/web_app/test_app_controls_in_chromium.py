@@ -295,6 +295,14 @@ def test_what_is_loaded_is_said_in_bytes(opened: Open, app: Path) -> None:
     opened.page.stop()
 
 
+def test_the_character_is_asked_for_before_the_face_reader(opened: Open) -> None:
+    """And nothing is said to be on its way once all is here."""
+    asked = [path for _, path in opened.host.requests]
+    assert asked.index("/character.glb") < asked.index("/webcam.graph")
+    assert not opened.page.driver.find_element("id", "loading").is_displayed()
+    until(lambda: opened.page.text("status") == "Start the camera to begin.")
+
+
 @pytest.mark.real
 def test_a_character_of_meshopt_and_ktx2_is_taken(opened: Open, data: Path) -> None:
     """Face Cap's head as three.js ships it, by the decoders that the page brings."""

@@ -67,7 +67,8 @@ def test_weights_are_pythons_the_character_is_drawn_and_the_rate_is_told(
         recorded = record(page, tmp_path, 40)
         assert_same_weights(webcam_graph(), recorded, TOLERANCE)
         assert np.array([one["weights"] for one in recorded.solved]).std(0).max() > 0.02
-        until(lambda: drawn_contrast(page) > 15)  # a busy machine may draw later than it solves
+        until(lambda: not page.driver.find_element("id", "loading").is_displayed())  # a busy machine may draw later
+        assert drawn_contrast(page) > 15
     with opened(app, faces, tmp_path, isolated, streamed=True) as page:
         page.start()
         until(lambda: page.driver.execute_script("return watched.solved.length") >= 150)
