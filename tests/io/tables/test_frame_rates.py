@@ -86,6 +86,14 @@ def test_a_rate_is_that_of_frames_while_they_come(fps: float, jitter: float, tog
     np.testing.assert_array_equal(found.seconds.numpy(), times)
 
 
+@pytest.mark.parametrize("jitter", [0.001, 0.008, 0.015])
+def test_what_a_network_held_back_is_no_pause(jitter: float) -> None:
+    times = of_frames(1200, 60.0, jitter)
+    within = times % 3
+    held = np.where((within > 1) & (within < 1.5), times - within + 1.5, times)
+    assert typical_rate(np.diff(held)) == pytest.approx(60.0, rel=0.01)
+
+
 @pytest.mark.parametrize(
     ("steps", "fps"),
     [

@@ -355,6 +355,21 @@ def test_only_the_newest_of_several_faces_is_given_unless_every_one_is_recorded(
         assert source.dropped == 5 - len(expected)
 
 
+def test_what_came_while_a_character_was_read_is_no_frame() -> None:
+    packets = LiveLinkPackets(ARKIT, 60.0)
+    with (
+        listening("livelink://127.0.0.1:0") as (source, _, _),
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
+    ):
+        for i in range(1, 6):
+            if i == 5:
+                source.skip()
+            sender.sendto(packets(torch.full((52,), i / 10), None)[0], ("127.0.0.1", source.receiver.port))
+        next(source.frames())
+        assert source.face.weights[0].item() == pytest.approx(0.5)
+        assert source.dropped == 0
+
+
 def test_weights_that_come_one_by_one_are_one_frame_of_a_recording() -> None:
     source = ReceivedSource("osc://127.0.0.1:0", every=True)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:

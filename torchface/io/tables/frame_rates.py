@@ -76,6 +76,10 @@ def typical_rate(steps: np.ndarray) -> float:
     whole, part = np.divmod(steps / middle, 1) if one_by_one else (np.ones(count), 0.0)
     frames = whole + np.clip((part - 0.35) / 0.3, 0, 1)
     counted = _up_to(_MISSED * middle if one_by_one else PAUSE * usual, steps)
+    if not one_by_one:  # after a pause nothing is made up for; what a network held back comes at once
+        ends = np.minimum(np.arange(count) + np.maximum(steps / usual, 1), count).astype(int)
+        spans = (times[ends] - times[:-1]) / (ends - np.arange(count))
+        counted = np.maximum(counted, np.clip(4 - 2.5 * spans / usual, 0, 1))
     lasting = float(counted @ steps)
     return float(counted @ frames) / lasting if lasting > 0 else count / float(steps.sum())
 

@@ -209,6 +209,7 @@ def go_live(
         solver: FaceSolver
         watch: Watch
         if received is not None:
+            received.skip()
             solver, watch = ReceivedSolver(received, notes), ReceivedWatch(received, say)
         else:
             preparing("loading the face reader")

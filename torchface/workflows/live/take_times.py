@@ -9,7 +9,7 @@ from torchface.number_checks import MAX_FPS, MIN_FPS
 _LEAST = 5e-4  # seconds between frames: what all files of a take keep, those in single precision up to two hours
 _TICK = 1 / 60_000  # seconds, which timecodes count
 _SPACED, _SLOWEST = 1.25 * PAUSE, 5.0  # steps, but not more seconds, between frames kept of a time when nobody sends
-_RELAXED = 4.0  # seconds in which nobody sends, and after which nothing moves
+_HELD, _RELAXED = 0.5, 4.0  # seconds in which nobody sends: nothing moves before and after; networks pause for less
 _OFF, _SHARE, _DRIFT = 0.1, 0.25, 2e-4  # of clocks: seconds, but not more of a take; seconds a second
 _OWN_RATE = 1e-4  # by which a rate may differ from the source's stated one
 
@@ -71,16 +71,16 @@ def _rising(times: np.ndarray) -> np.ndarray:
 
 
 def _with_pauses(times: np.ndarray, fresh: np.ndarray, spaced: float) -> np.ndarray:
-    """Rows that came; of those between them, where nobody sent for longer than ``spaced`` seconds, some that are so far
-    apart, and the last one of each pause."""
+    """Rows that came; of those in pauses some that are ``spaced`` seconds apart, and the last one of each pause."""
     kept, heard, last = list[int](), 0.0, 0.0
     came = np.flatnonzero(fresh)
     for row in range(came[0], came[-1] + 1):
+        pause = times[row] - heard
         if fresh[row]:
-            if kept and row - 1 > kept[-1] and times[row - 1] - heard > spaced:
+            if kept and row - 1 > kept[-1] and times[row - 1] - heard > max(spaced, _HELD):
                 kept.append(row - 1)
             heard = times[row]
-        elif times[row] - last <= spaced or times[row] - heard > _RELAXED:
+        elif times[row] - last <= spaced or not _HELD < pause <= _RELAXED:
             continue
         kept.append(row)
         last = times[row]
