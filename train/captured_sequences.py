@@ -1,19 +1,13 @@
 """A captured performance as files hold it: sequences of frames of one topology, gathered into one file on disk."""
 
-import lzma
 import re
-import zipfile
-import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import groupby
-from math import prod
 from pathlib import Path
 
-import numpy as np
 import torch
-from numpy.lib import format as npy
 from torch import Tensor
 
 from torchface import Mesh, load_mesh
@@ -30,13 +24,6 @@ _METHOD = "captured sequences/1"
 _NEUTRAL = "neutral"
 _ANIMATIONS = (".glb", ".gltf", ".safetensors", ".npz")
 _BLOCK = 8  # frames that are read at a time
-_MOST_BYTES = 2**33  # of an .npz file's arrays, which are read whole
-_MOST_COMPRESSED = 100  # times; measured positions become two to four times smaller, zeros a thousand times
-# What zipfile, its decompressors and numpy raise of damaged and built archives.
-_UNREADABLE = (
-    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, OSError, EOFError),
-    *(ValueError, KeyError, TypeError, ArithmeticError, RuntimeError, MemoryError),
-)
 _NUMBER = re.compile(r"[ _.-]*\d+$")
 _RISE, _HOLD, _FALL = (0.2, 0.5), (0.1, 0.4), (0.3, 0.7)  # seconds of a performer's expressions
 _SAME_RATE = 2e-3  # relative
@@ -222,9 +209,6 @@ def _bare(name: str) -> str:
 
 
 def _animated(path: Path) -> CapturedSequence:
-    if path.suffix.lower() == ".npz":
-        vertices, faces = _npz(path)
-        return CapturedSequence(path.name, len(vertices), lambda begin, end: vertices[begin:end], faces)
     found = load_animated(path)
     return CapturedSequence(path.name, found.count, found.read, found.neutral.faces, found.colors, found.fps)
 
@@ -232,44 +216,6 @@ def _animated(path: Path) -> CapturedSequence:
 def _of_meshes(name: str, files: list[Path]) -> CapturedSequence:
     animated = meshes_over_time(Path(name), files, None)
     return CapturedSequence(name, animated.count, animated.read, animated.neutral.faces, colors=animated.colors)
-
-
-def _npz(path: Path) -> tuple[Tensor, Tensor]:
-    """``vertices`` (T,V,3) and ``faces`` (F,3) of an archive whose sizes are checked before memory is taken."""
-    try:
-        with zipfile.ZipFile(path) as archive:
-            arrays = [_array(archive, path, name) for name in ("vertices", "faces")]
-    except _UNREADABLE as error:
-        raise FileFormatError(f"{path}: no .npz file of vertices and faces ({error})") from error
-    vertices, faces = arrays
-    if vertices.ndim != 3 or vertices.shape[2] != 3 or faces.ndim != 2 or faces.shape[1] != 3 or not len(vertices):
-        raise FileFormatError(
-            f"{path}: found vertices {vertices.shape} and faces {faces.shape}, expected (T,V,3) and (F,3)"
-        )
-    if faces.dtype.kind not in "iu" or faces.size == 0 or not 0 <= faces.min() <= faces.max() < vertices.shape[1]:
-        raise FileFormatError(f"{path}: found faces of vertices beyond the {vertices.shape[1]} there are")
-    return torch.from_numpy(vertices.astype(np.float32)), torch.from_numpy(faces.astype(np.int64))
-
-
-def _array(archive: zipfile.ZipFile, path: Path, name: str) -> np.ndarray:
-    stored = archive.getinfo(f"{name}.npy")
-    with archive.open(stored) as file:
-        version = npy.read_magic(file)
-        header = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-        shape, _, kind = header(file)
-        size = kind.itemsize * prod(shape) if kind.kind in "fiu" else -1
-        if not 0 <= size <= min(stored.file_size, _MOST_BYTES):
-            raise FileFormatError(
-                f"{path}: found {name} {shape!s:.80} of {kind!s:.80} in {stored.file_size} bytes, expected numbers of "
-                f"at most {_MOST_BYTES // 2**30} GiB"
-            )
-        if size > 2**20 + _MOST_COMPRESSED * stored.compress_size:
-            raise FileFormatError(
-                f"{path}: found {name} of {size} bytes compressed into {stored.compress_size}, expected measured "
-                f"positions, which become at most {_MOST_COMPRESSED} times smaller"
-            )
-    with archive.open(stored) as file:
-        return npy.read_array(file, allow_pickle=False)
 
 
 def _gesture(

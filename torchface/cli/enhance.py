@@ -46,9 +46,10 @@ def enhance(
 ) -> None:
     """Enhance a coarse animation with the wrinkles, creases and pores of a captured actor.
 
-    INPUT is markers (.c3d, .trc, .csv, with --attachment), weights (.csv, with --rig), an animated .glb, a mesh
-    sequence (.safetensors), a folder of meshes, a frame each, or the folder of `torchface track`. Meshes of the model's
-    topology pass straight; others are registered to the model, or by --pairs.
+    INPUT is markers (.c3d, .trc, .csv, with --attachment), weights (.csv, with --rig), an animated .glb or USD file, a
+    mesh sequence (.safetensors, or .npz with vertices (T,V,3) and faces (F,3)), a folder of meshes, a frame each, or
+    the folder of `torchface track`. Meshes of the model's topology pass straight; others are registered to the model,
+    or by --pairs.
 
     Writes into OUT: enhanced.safetensors (every frame's mesh), enhanced.glb, comparison.mp4, frames.csv (how near the
     model comes, by region), summary.json and the report index.html. Killed and started again, it goes on where it was.
@@ -68,7 +69,8 @@ def enhance(
         neutral: A frame of the markers with the face at rest; motion counts from it. From the sites if absent.
         fps: Frames a second of meshes; 30 if absent.
         labels: What the take's labels are called in the attachment; see `torchface solve`.
-        unit: What the markers' coordinates are in; what the file says if absent.
+        unit: What the coordinates of markers or meshes are in; if absent what the file says, else millimetres. Meshes:
+            mm, cm or m.
         flip: Negate this axis of the markers' coordinates.
         meshes: Also write every frame as a mesh file of this kind.
         textures: A mesh of the model's topology with texture coordinates, such as the captured neutral: colours that

@@ -14,6 +14,8 @@ from torch import Tensor
 from torchface.errors import FileFormatError, NameMismatchError, TopologyError, ValueRangeError
 from torchface.files.whole_files import check_there, numbered_order
 from torchface.io import MeshSequence, load_animation, load_mesh, load_rig, load_take
+from torchface.io.head_models.array_files import ArrayFile
+from torchface.io.length_units import millimetres_per
 from torchface.io.markers.marker_csv import is_marker_header
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
@@ -28,11 +30,14 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.workflows.weight_files import check_whole_frames
 
-_FORMS = "weights as .csv, an animated .glb or .usdc, a mesh sequence as .safetensors, a mesh, or a folder of meshes"
+_FORMS = (
+    "weights as .csv, an animated .glb or .usdc, a mesh sequence as .safetensors or .npz, a mesh, or a folder of meshes"
+)
 
 DEFAULT_FPS = 30.0
 _SAME_RATE = 2e-3  # relative; 29.97 and 30 are the same
 _KEPT = 8  # meshes
+_MOST_COMPRESSED = 100  # times; measured positions become two to four times smaller, zeros a thousand times
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,29 +69,36 @@ class AnimatedMesh:
             )
 
 
-def load_animated(path: Path, rig: Path | None = None, part: str | None = None) -> AnimatedMesh:
+def load_animated(
+    path: Path, rig: Path | None = None, part: str | None = None, unit: str | None = None
+) -> AnimatedMesh:
     """Reads meshes over time.
 
     Args:
         path: weights as ``.csv`` or what phones record (of which the rig makes meshes); a glTF or USD file with an
             animation of its shapes, or without, which is one frame; a mesh sequence as ``.safetensors``
-            (:class:`torchface.io.MeshSequence`); a mesh; or a folder of meshes, a frame each, in the order of their
-            names.
+            (:class:`torchface.io.MeshSequence`) or ``.npz`` (``vertices`` (T,V,3), ``faces`` (F,3)); a mesh; or a
+            folder of meshes, a frame each, in the order of their names.
         rig: what weights move, or the rig whose topology the meshes have.
         part: keep this annotated region only, such as ``face``.
+        unit: of meshes and ``.npz``, see :func:`torchface.io.load_mesh`; the other files say it.
     """
     loaded = None if rig is None else load_rig(rig)
     ending = path.suffix.lower()
     if path.is_dir():
-        animated = _of_folder(path, loaded)
+        animated = _of_folder(path, loaded, unit)
+    elif ending in MESH_ENDINGS:
+        animated = meshes_over_time(path, [path], loaded, unit)
+    elif ending == ".npz":
+        animated = _of_arrays(path, loaded, unit)
+    elif unit is not None:
+        raise ValueRangeError(f"{path}: found --unit {unit}, expected it of markers and meshes alone, not of {ending}")
     elif ending in (".csv", *RECORDING_ENDINGS):
         animated = _of_weights(path, loaded)
     elif ending == ".safetensors":
         animated = _of_sequence(path, loaded)
     elif ending in SCENE_ENDINGS:
         animated = _of_scene(path, loaded)
-    elif ending in MESH_ENDINGS:
-        animated = meshes_over_time(path, [path], loaded)
     else:
         check_there(path)
         raise FileFormatError(f"{path}: found the ending {ending!r}, expected {_FORMS}")
@@ -111,6 +123,8 @@ def is_animation(path: Path) -> bool:
         return is_live_link(header) or (is_numbered(header) and not is_marker_header(header))
     if ending == ".json":
         return is_weight_json(path)
+    if ending == ".npz":
+        return {"vertices", "faces"} <= set(ArrayFile(path).names)
     return ending in (".safetensors", *RECORDING_ENDINGS, *MESH_ENDINGS, *SCENE_ENDINGS)
 
 
@@ -191,12 +205,23 @@ def _of_sequence(path: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
     return AnimatedMesh(path, neutral, len(sequence), sequence.read, sequence.fps, rig=rig)
 
 
-def _of_folder(folder: Path, rig: BlendshapeRig | None) -> AnimatedMesh:
+def _of_arrays(path: Path, rig: BlendshapeRig | None, unit: str | None) -> AnimatedMesh:
+    # What becomes so much larger is none, and would fill the memory.
+    arrays = ArrayFile(path, 2**20 + _MOST_COMPRESSED * (path.stat().st_size if path.is_file() else 0))
+    vertices = arrays.numbers("vertices", None, None, 3, finite=False) * millimetres_per(unit or "mm")
+    if min(vertices.shape) == 0:
+        raise arrays.error("vertices", "frames (T,V,3)")
+    faces = arrays.indices("faces", None, 3, below=vertices.shape[1])
+    neutral = _at_rest(path, Mesh(vertices[0].nan_to_num(0.0), faces), rig)
+    return AnimatedMesh(path, neutral, len(vertices), lambda begin, end: vertices[begin:end], rig=rig)
+
+
+def _of_folder(folder: Path, rig: BlendshapeRig | None, unit: str | None) -> AnimatedMesh:
     meshes = (file for file in folder.iterdir() if file.suffix.lower() in (*MESH_ENDINGS, *SCENE_ENDINGS))
     files = sorted(meshes, key=numbered_order)
     if not files:
         raise FileFormatError(f"{folder}: found no mesh, expected files ending in {', '.join(MESH_ENDINGS)} or .glb")
-    return replace(meshes_over_time(folder, files, rig), missing=_missing(files))
+    return replace(meshes_over_time(folder, files, rig, unit), missing=_missing(files))
 
 
 def _missing(files: list[Path]) -> str:
@@ -212,13 +237,13 @@ def _missing(files: list[Path]) -> str:
     return f"{lost} of {len(files) + lost} frames are missing, first from {' to '.join(leaps[0])}" if leaps else ""
 
 
-def meshes_over_time(path: Path, files: list[Path], rig: BlendshapeRig | None) -> AnimatedMesh:
+def meshes_over_time(path: Path, files: list[Path], rig: BlendshapeRig | None, unit: str | None = None) -> AnimatedMesh:
     """Meshes of one topology, a file a frame."""
-    first = load_mesh(files[0])
+    first = load_mesh(files[0], unit)
 
     @lru_cache(maxsize=_KEPT)  # vertices and colours of a frame are asked for after one another
     def one(file: Path) -> Mesh:
-        mesh = load_mesh(file)
+        mesh = load_mesh(file, unit)
         if len(mesh.vertices) != len(first.vertices) or not torch.equal(mesh.faces, first.faces):
             raise TopologyError(
                 f"{file}: found {len(mesh.vertices)} vertices and {len(mesh.faces)} triangles, expected those of "

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 
@@ -45,6 +46,7 @@ from torchface.workflows.enhance import enhance_views, enhanced_frames, head_cor
 from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
 from torchface.workflows.enhance.enhance_animation import EnhanceSettings, animation_targets, enhance_animation
 from torchface.workflows.enhance.enhance_page import write_enhance_page
+from torchface.workflows.marker_input import MarkerOptions
 
 PLAIN = EnhanceSettings(glb=False, video=False)
 
@@ -115,6 +117,23 @@ def test_all_files_of_one_animation_give_the_same(actor: Actor, tmp_path: Path) 
     for path in (tmp_path / "animation.glb", tmp_path / "tracked"):
         note = coarse(actor, path, tmp_path, rig=actor.folder / "rig.glb").notes[0]
         assert note == f"warning: --rig {actor.folder / 'rig.glb'} is not used: animation.glb has its own rig"
+
+
+def test_meshes_in_metres_are_read_by_their_unit(actor: Actor, tmp_path: Path) -> None:
+    frames, faces = actor.frames, actor.mesh.faces
+    (tmp_path / "plys").mkdir()
+    for t in range(FRAMES):
+        save_mesh(Mesh(frames[t] / 1000, faces), tmp_path / "plys" / f"frame_{t:02d}.ply")
+    np.savez(tmp_path / "arrays.npz", vertices=frames / 1000, faces=faces)
+    in_metres = MarkerOptions(unit="m")
+    for path in (tmp_path / "plys", tmp_path / "arrays.npz"):
+        found = coarse(actor, path, tmp_path, markers=in_metres)
+        torch.testing.assert_close(found.read(3, 7), frames[3:7], atol=2e-3, rtol=0)
+        with pytest.raises(AlignmentError, match=r"it seems to be in metres \(--unit"):
+            coarse(actor, path, tmp_path)
+    save_animation(actor.rig, load_take(actor.folder / "weights.csv"), tmp_path / "animation.glb")
+    with pytest.raises(ValueRangeError, match=r"found --unit m, expected it of markers and meshes alone, not of \.glb"):
+        coarse(actor, tmp_path / "animation.glb", tmp_path, markers=in_metres)
 
 
 def test_a_result_has_the_rate_of_its_input(actor: Actor, tmp_path: Path) -> None:

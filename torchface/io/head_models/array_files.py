@@ -1,5 +1,6 @@
 """Named arrays of a NumPy archive or a safetensors file: looked at before they are read, and never unpickled."""
 
+import lzma
 import zipfile
 import zlib
 from collections.abc import Collection
@@ -21,7 +22,11 @@ LARGEST_ARRAYS = 2**31  # bytes of all arrays that are read of a file
 _LARGEST_FILE, _MOST_ENTRIES, _MOST_VERTICES, _HEADER = 2**32, 1000, 2**20, 2**16
 _LARGEST_NUMBER = 1e6  # of a model's lengths in its own unit, far above any
 _PICKLES = (".pkl", ".pickle", ".pt", ".pth", ".ckpt")
-_BROKEN = (zipfile.BadZipFile, zlib.error, SafetensorError, OSError, ValueError, EOFError)
+# Among what zipfile raises: RuntimeError of an encrypted entry, NotImplementedError of a compression without a reader.
+_BROKEN = (
+    *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, SafetensorError),
+    *(OSError, ValueError, EOFError, ArithmeticError, RuntimeError),
+)
 ONLY = "array"  # the name of what a .npy holds
 _HOW = (
     "A pickle runs what its author wrote, so torchface opens none. Convert it once, in a process of its own, with the "
@@ -62,7 +67,7 @@ class ArrayFile:
                 self._stored = self._npy_header()
             else:
                 self._stored = self._npz_headers() if begin[:2] == b"PK" else self._safetensors_headers()
-        except (*_BROKEN, NotImplementedError) as e:
+        except _BROKEN as e:
             raise FileFormatError(f"{self.path}: found no readable arrays ({e}), expected .npz or .safetensors") from e
 
     def __contains__(self, name: str) -> bool:
@@ -216,6 +221,8 @@ def _header(file: Any) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
 
 
 def _stored(shape: tuple[int, ...], dtype: np.dtype[Any]) -> StoredArray:
+    if not all(type(n) is int and n >= 0 for n in shape):
+        raise ValueError(f"the shape {shape!s:.80}")
     size = int(np.prod([max(n, 1) for n in shape], dtype=object)) * dtype.itemsize
     return StoredArray(shape, "O" if dtype.hasobject else dtype.kind, size)
 

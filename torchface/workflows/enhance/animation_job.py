@@ -23,7 +23,9 @@ def is_coarse(path: Path) -> bool:
     return tracked_animation(path) != path or is_animation(path) or (path.is_file() and is_markers(path))
 
 
-ANIMATIONS = ItemKind("animation", "enhanced", (*MARKER_ENDINGS, ".csv", ".safetensors", *SCAN_ENDINGS), is_coarse)
+ANIMATIONS = ItemKind(
+    "animation", "enhanced", (*MARKER_ENDINGS, ".csv", ".safetensors", ".npz", *SCAN_ENDINGS), is_coarse
+)
 
 
 @dataclass(frozen=True)

@@ -54,11 +54,11 @@ def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, p
         return _markers(path, model, settings, state, progress)
     options = settings.markers
     of_markers = {"--attachment": settings.attachment, "--neutral": settings.neutral, "--labels": options.labels}
-    for name, value in {**of_markers, "--unit": options.unit, "--flip": options.flip}.items():
+    for name, value in {**of_markers, "--flip": options.flip}.items():
         if value is not None:
             raise ValueRangeError(f"{path}: found {name} and no markers, expected a .c3d, .trc or .csv of markers")
     source = tracked_animation(path)
-    animated, notes = _even(load_animated(source, settings.rig, settings.part), settings.fps)
+    animated, notes = _even(load_animated(source, settings.rig, settings.part, options.unit), settings.fps)
     if settings.rig is not None and animated.take is not None and source.suffix.lower() in SCENE_ENDINGS:
         notes = [*notes, f"warning: --rig {settings.rig} is not used: {source.name} has its own rig"]
     if has_topology_of(animated.neutral, model):

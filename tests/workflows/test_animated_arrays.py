@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from torchface.errors import FileFormatError
-from train.captured_sequences import _animated
+from torchface.workflows.animated_meshes import is_animation, load_animated
 
 RANDOM = np.random.default_rng(0)
 VERTICES = RANDOM.random((4, 5, 3), dtype=np.float32)
@@ -25,7 +25,7 @@ def archive(path: Path, vertices: bytes) -> Path:
     faces = io.BytesIO()
     np.save(faces, FACES)
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
-        file.writestr("../vertices.npy", b"outside")
+        file.writestr("../vertices.npy", npy(shape="(1, 5, 3)", data=bytes(60)))
         file.writestr("vertices.npy", vertices)
         file.writestr("faces.npy", faces.getvalue())
     return path
@@ -36,9 +36,10 @@ def archive(path: Path, vertices: bytes) -> Path:
 def test_every_layout_is_read(tmp_path: Path, kind: str, order: str) -> None:
     vertices = np.asarray(VERTICES.astype(kind), order=order)
     np.savez_compressed(tmp_path / "a.npz", vertices=vertices, faces=FACES)
-    found = _animated(tmp_path / "a.npz")
+    assert is_animation(tmp_path / "a.npz")
+    found = load_animated(tmp_path / "a.npz")
     np.testing.assert_array_equal(found.read(1, 3), VERTICES[1:3])
-    np.testing.assert_array_equal(found.faces, FACES)
+    np.testing.assert_array_equal(found.neutral.faces, FACES)
 
 
 @pytest.mark.parametrize(
@@ -57,7 +58,7 @@ def test_every_layout_is_read(tmp_path: Path, kind: str, order: str) -> None:
 )
 def test_built_headers_are_refused(tmp_path: Path, shape: str, kind: str) -> None:
     with pytest.raises(FileFormatError, match=r"a\.npz"):
-        _animated(archive(tmp_path / "a.npz", npy(shape, kind)))
+        load_animated(archive(tmp_path / "a.npz", npy(shape, kind)))
 
 
 def test_damaged_archives_are_refused_or_read(tmp_path: Path) -> None:
@@ -69,7 +70,7 @@ def test_damaged_archives_are_refused_or_read(tmp_path: Path) -> None:
             damaged[place] = RANDOM.integers(256)
         (tmp_path / "b.npz").write_bytes(damaged)
         try:
-            _animated(tmp_path / "b.npz")
+            load_animated(tmp_path / "b.npz")
         except FileFormatError:
             refused += 1
     assert refused > 100
@@ -78,5 +79,10 @@ def test_damaged_archives_are_refused_or_read(tmp_path: Path) -> None:
 def test_what_would_fill_the_memory_is_refused_before_it_is_read(tmp_path: Path) -> None:
     """40 MB of zeros in 40 KB."""
     count = 10 * 2**20 // 15
-    with pytest.raises(FileFormatError, match=r"compressed into .*, expected measured positions"):
-        _animated(archive(tmp_path / "a.npz", npy(f"({count}, 5, 3)", data=bytes(60 * count))))
+    with pytest.raises(FileFormatError, match=r"found vertices of 419430\d\d bytes, expected at most 5\d{6} "):
+        load_animated(archive(tmp_path / "a.npz", npy(f"({count}, 5, 3)", data=bytes(60 * count))))
+
+
+def test_arrays_are_in_the_unit_that_is_said(tmp_path: Path) -> None:
+    path = archive(tmp_path / "a.npz", npy())
+    np.testing.assert_allclose(load_animated(path, unit="m").read(0, 4), 1000 * VERTICES, rtol=1e-6)
