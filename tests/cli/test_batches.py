@@ -59,7 +59,7 @@ def test_a_folder_of_takes_is_solved_as_each_alone(
     told = " ".join(capsys.readouterr().err.split())
     assert "2 of 3 takes solved" in told
     assert "result: 2 good" in told
-    assert "left out 1 video and 1 file that holds no take, expected takes" in told
+    assert "left out 1 video and 1 file that holds no take (film.mp4, weights.csv), expected takes" in told
     found = rows(out)
     assert {name: row["status"] for name, row in found.items()} == {"blind": "skipped", "calm": "done", "loud": "done"}
     assert float(found["calm"]["rmse_mm"]) < 0.1

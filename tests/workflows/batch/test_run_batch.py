@@ -149,12 +149,14 @@ def test_a_full_disk_stops_the_run_and_what_is_finished_is_kept(words: Path, mon
 
 
 def test_what_a_folder_holds_of_other_kinds_is_told(tmp_path: Path) -> None:
-    for name in ("a.obj", "b.ply", "c.mp4", "d.c3d", "e.mp4", "a.mtl", "a.ljson", ".hidden.obj"):
+    for name in ("a.obj", "b.ply", "c.mp4", "d.c3d", "e.mp4", "a.mtl", "a.ljson", "skin.png", ".hidden.obj"):
         (tmp_path / name).write_text("x")
     scans = ItemKind("scan", "registered", (".obj", ".ply"))
     found = find_items([tmp_path, tmp_path / "a.obj", tmp_path / "gone.obj"], scans)
     assert [item.name for item in found.items] == ["a", "b", "gone"]
-    assert found.left_out == (f"{tmp_path}: left out 1 marker take and 2 videos, expected scans (.obj, .ply)",)
+    assert found.left_out == (
+        f"{tmp_path}: left out 1 marker take and 2 videos (d.c3d, c.mp4, e.mp4), expected scans (.obj, .ply)",
+    )
     pictures = ItemKind("picture", "seen", (".exr",))
     with pytest.raises(FileFormatError, match="no picture in the folder but 2 scans or meshes and 1 marker take"):
         find_items([tmp_path], pictures)
@@ -163,6 +165,19 @@ def test_what_a_folder_holds_of_other_kinds_is_told(tmp_path: Path) -> None:
         find_items([tmp_path], odd)
     assert is_batch([tmp_path], scans)
     assert not is_batch([tmp_path / "a.obj"], scans)
+
+
+def test_files_that_belong_to_nothing_are_named_up_to_five(tmp_path: Path) -> None:
+    takes = ItemKind("take", "solved", (".c3d", ".csv"), lambda path: path.suffix == ".c3d")
+    for name in ("d.c3d", "d_sites.json", "e.mp4", "rig.png", "weights.csv"):
+        (tmp_path / name).write_text("x")
+    (words,) = find_items([tmp_path], takes).left_out
+    found = "1 video and 1 file that holds no take and 1 other file (e.mp4, weights.csv, rig.png)"
+    assert words == f"{tmp_path}: left out {found}, expected takes (.c3d, .csv)"
+    for name in "fghi":
+        (tmp_path / f"{name}.txt").write_text("x")
+    (words,) = find_items([tmp_path], takes).left_out
+    assert "and 5 other files (e.mp4, weights.csv, f.txt, g.txt, h.txt, ...), expected" in words
 
 
 def test_each_of_many_results_has_a_place_of_its_own() -> None:

@@ -24,6 +24,8 @@ NAME = "{name}"  # stands in an option's path for the item's name
 SCAN_ENDINGS = (*MESH_ENDINGS, *SCENE_ENDINGS)
 SUMMARY, RECORDS = "summary.csv", "records"  # of a batch: its table, and the folder of its records
 _OWN = (SUMMARY, RECORDS)
+_BESIDE_MESHES = (".mtl", ".png", ".jpg", ".jpeg", ".tga", ".tif", ".tiff", ".bmp", ".exr", ".bin")
+_NAMED = 5  # files that are left out
 _KINDS = (("scan or mesh", SCAN_ENDINGS), ("marker take", MARKER_ENDINGS), ("video", VIDEO_ENDINGS))
 
 
@@ -99,8 +101,8 @@ def is_batch(inputs: Sequence[Path], kind: ItemKind) -> bool:
 def find_items(inputs: Sequence[str | Path], kind: ItemKind) -> FoundItems:
     """Files as named, and for each folder the items in it, sorted by name; absolute, none twice.
 
-    Files of another kind in a folder are left out and named; what may belong to an item (images, landmarks, tables) is
-    left alone.
+    Other files in a folder are left out and named; what may belong to an item (whose name begins with the item's, and
+    beside meshes their images and materials) is left alone.
     """
     files: dict[Path, None] = {}
     left_out = []
@@ -110,7 +112,7 @@ def find_items(inputs: Sequence[str | Path], kind: ItemKind) -> FoundItems:
             continue
         visible = [path for path in sorted(given.iterdir()) if path.name[0] != "." and path.name not in _OWN]
         inside = [path for path in visible if kind.holds(path)]
-        others = _others([path for path in visible if path not in set(inside)], kind)
+        others = _others([path for path in visible if path not in set(inside)], inside, kind)
         expected = f"expected {kind.noun}s ({', '.join(kind.endings)})"
         if not inside:
             found_instead = f" but {others}" if others else ""
@@ -142,15 +144,24 @@ def check_folder(out: Path) -> None:
         )
 
 
-def _others(paths: Sequence[Path], kind: ItemKind) -> str:
-    """How many files of which other kinds there are, in words."""
-    counts = []
-    for noun, endings in _KINDS:
-        count = sum(path.suffix.lower() in endings and path.suffix.lower() not in kind.endings for path in paths)
-        counts.append((count, noun))
-    odd = sum(path.suffix.lower() in kind.endings and path.is_file() for path in paths)
-    counts.append((odd, f"file that holds no {kind.noun}"))
-    return " and ".join(f"{count} {_plural(noun) if count > 1 else noun}" for count, noun in counts if count)
+def _others(paths: Sequence[Path], items: Sequence[Path], kind: ItemKind) -> str:
+    """How many files of which other kinds there are, in words, and the names of the first."""
+    found: dict[str, list[Path]] = {}
+    beside = tuple(item.stem for item in items)
+    of_meshes = _BESIDE_MESHES if set(MESH_ENDINGS) & set(kind.endings) else ()
+    for path in paths:
+        ending = path.suffix.lower()
+        noun = next((noun for noun, endings in _KINDS if ending in endings and ending not in kind.endings), "")
+        if not noun and path.is_file():
+            belongs = path.stem.startswith(beside) or ending in of_meshes
+            noun = f"file that holds no {kind.noun}" if ending in kind.endings else "" if belongs else "other file"
+        if noun:
+            found.setdefault(noun, []).append(path)
+    order = [*(noun for noun, _ in _KINDS), f"file that holds no {kind.noun}", "other file"]
+    counts = [(noun, len(found[noun])) for noun in order if noun in found]
+    names = [path.name for noun, _ in counts for path in found[noun]]
+    words = " and ".join(f"{count} {_plural(noun) if count > 1 else noun}" for noun, count in counts)
+    return f"{words} ({', '.join(names[:_NAMED])}{', ...' if len(names) > _NAMED else ''})" if words else ""
 
 
 def _plural(noun: str) -> str:
