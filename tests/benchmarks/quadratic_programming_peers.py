@@ -13,7 +13,7 @@ from scipy.optimize import lsq_linear
 from scipy.sparse import csc_matrix, eye
 from torch import Tensor
 
-Solver = Callable[[np.ndarray], np.ndarray]
+Solver = Callable[..., np.ndarray]
 HessianSolver = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
@@ -25,8 +25,8 @@ def daqp_solver(H: np.ndarray) -> Solver:
     solver = daqp.Model()
     solver.setup(H, np.zeros(size), np.zeros((0, size)), np.ones(size), np.zeros(size), np.zeros(size, np.int32))
 
-    def solve(f: np.ndarray) -> np.ndarray:
-        solver.update(f=f)
+    def solve(f: np.ndarray, **changed: np.ndarray) -> np.ndarray:
+        solver.update(f=f, **changed)
         return np.clip(solver.solve()[0], 0, 1)
 
     return solve
@@ -43,8 +43,8 @@ def piqp_solver(H: np.ndarray, tolerance: float | None = None) -> Solver:
     size = len(H)
     solver.setup(H, np.zeros(size), None, None, None, None, None, np.zeros(size), np.ones(size))
 
-    def solve(f: np.ndarray) -> np.ndarray:
-        solver.update(c=f)
+    def solve(f: np.ndarray, **changed: np.ndarray) -> np.ndarray:
+        solver.update(c=f, **changed)
         solver.solve()
         return np.clip(solver.result.x, 0, 1)
 
@@ -123,32 +123,13 @@ def installed(module: str) -> bool:
 
 
 def daqp_with_hessians(size: int) -> HessianSolver:
-    import daqp
-
-    solver = daqp.Model()
-    solver.setup(
-        np.eye(size), np.zeros(size), np.zeros((0, size)), np.ones(size), np.zeros(size), np.zeros(size, np.int32)
-    )
-
-    def solve(H: np.ndarray, f: np.ndarray) -> np.ndarray:
-        solver.update(H=H, f=f)
-        return np.clip(solver.solve()[0], 0, 1)
-
-    return solve
+    solve = daqp_solver(np.eye(size))
+    return lambda H, f: solve(f, H=H)
 
 
 def piqp_with_hessians(size: int) -> HessianSolver:
-    import piqp
-
-    solver = piqp.DenseSolver()
-    solver.setup(np.eye(size), np.zeros(size), None, None, None, None, None, np.zeros(size), np.ones(size))
-
-    def solve(H: np.ndarray, f: np.ndarray) -> np.ndarray:
-        solver.update(P=H, c=f)
-        solver.solve()
-        return np.clip(solver.result.x, 0, 1)
-
-    return solve
+    solve = piqp_solver(np.eye(size))
+    return lambda H, f: solve(f, P=H)
 
 
 def quadprog_with_hessians(size: int) -> HessianSolver:
