@@ -32,22 +32,14 @@ _TWO_SIDED = 3  # takes of each gesture: both sides, left more, right more
 
 @dataclass(frozen=True, eq=False)
 class CapturedSequence:
-    """Frames from the neutral to an expression and back.
+    """Frames from the neutral to an expression and back."""
 
-    Args:
-        name: of the file or folder.
-        read: vertices (t,V,3) of the frames from one number up to another, without it, millimetres.
-        faces: (F,3) int64, of its own file.
-        colors: of the vertices, (t,V,3) in [0,1], read as ``read`` does, where there are some.
-        fps: frames a second, where its file says.
-    """
-
-    name: str
+    name: str  # of the file or folder
     count: int
-    read: Callable[[int, int], Tensor]
-    faces: Tensor
-    colors: Callable[[int, int], Tensor] | None = None
-    fps: float | None = None
+    read: Callable[[int, int], Tensor]  # vertices (t,V,3) of frames from one number up to another, without it
+    faces: Tensor  # (F,3) int64, of its own file
+    colors: Callable[[int, int], Tensor] | None = None  # of the vertices, (t,V,3) in [0,1], where there are some
+    fps: float | None = None  # frames a second, where its file says
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,23 +15,14 @@ _MAX_LEFT_OUT = 400
 
 @dataclass(frozen=True, eq=False)
 class ModelQuality:
-    """The three measures for models of 1 to K components; errors are root mean squares over the vertices.
+    """The three measures for models of 1 to K components; errors are root mean squares over the vertices."""
 
-    Args:
-        components: how many, (J,) int64.
-        compactness: share of the variance they hold, (J,).
-        generalisation: how far a sample lies from the model of all the others, the mean over the samples, (J,).
-        generalisation_error: standard error of that mean, (J,).
-        specificity: how far random samples of the model lie from the nearest training sample, the mean, (J,).
-        nearest: how far training samples lie from the nearest other one, the mean: what specificity is held against.
-    """
-
-    components: Tensor
-    compactness: Tensor
-    generalisation: Tensor
-    generalisation_error: Tensor
-    specificity: Tensor
-    nearest: float
+    components: Tensor  # how many, (J,) int64
+    compactness: Tensor  # share of the variance they hold, (J,)
+    generalisation: Tensor  # how far a sample lies from the model of all the others, the mean over the samples, (J,)
+    generalisation_error: Tensor  # standard error of that mean, (J,)
+    specificity: Tensor  # how far random samples of the model lie from the nearest training sample, the mean, (J,)
+    nearest: float  # how far training samples lie from the nearest other one, the mean: beside it stands specificity
 
 
 def model_quality(

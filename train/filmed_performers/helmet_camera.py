@@ -23,23 +23,14 @@ _PLATES = (
 
 @dataclass(frozen=True)
 class CameraFlaws:
-    """What is wrong with the images.
+    """What is wrong with the images."""
 
-    Args:
-        noise: standard deviation of a grey value's noise at full brightness, of 1; read noise is a third of it.
-        exposure: brightness against a well exposed image.
-        blur: of the lens, standard deviation in pixels.
-        vignette: how much darker the corners are.
-        shake_rotation: amplitude of the camera's shake about each axis, degrees.
-        shake_translation: along each axis, millimetres.
-    """
-
-    noise: float = 0.02
-    exposure: float = 1.0
-    blur: float = 0.5
-    vignette: float = 0.25
-    shake_rotation: float = 0.35
-    shake_translation: float = 0.7
+    noise: float = 0.02  # standard deviation of a grey value at full brightness, of 1; read noise is a third of it
+    exposure: float = 1.0  # brightness against a well exposed image
+    blur: float = 0.5  # of the lens, standard deviation in pixels
+    vignette: float = 0.25  # how much darker the corners are
+    shake_rotation: float = 0.35  # amplitude of the camera's shake about each axis, degrees
+    shake_translation: float = 0.7  # along each axis, millimetres
 
 
 def helmet_camera(width: int = 192, height: int = 256) -> Camera:

@@ -19,20 +19,7 @@ _IRIS = torch.tensor(
 
 @dataclass(frozen=True, eq=False)
 class Looks:
-    """One person's looks; colours are sRGB (3,), shares and strengths lie in [0,1].
-
-    Args:
-        skin, lips, hair, iris, clothes: colours.
-        gloss: how much light the skin mirrors.
-        brow: share of hair in the brows, their thickness and their arch beside the usual, and millimetres that they
-            lie higher.
-        beard, moustache, stubble: shares of hair.
-        liner, shadow: of make-up round the eyes; ``shadow_color`` its colour.
-        lashes: dark lashes, or none that show.
-        hat: the colour of a cap instead of hair; None without.
-        glasses: half their width and height, millimetres, grey of the frame, its thickness in pixels of the picture,
-            and how dark the lenses are; None for none.
-    """
+    """One person's looks; colours are sRGB (3,), shares and strengths lie in [0,1]."""
 
     skin: Tensor
     lips: Tensor
@@ -43,17 +30,19 @@ class Looks:
     freckles: float
     shadows: float
     wrinkles: float
-    gloss: float
+    gloss: float  # how much light the skin mirrors
+    # Share of hair in the brows, their thickness and their arch beside the usual, and millimetres that they lie higher.
     brow: tuple[float, float, float, float]
-    beard: float
+    beard: float  # share of hair, as the next two
     moustache: float
     stubble: float
-    liner: float
+    liner: float  # make-up round the eyes, as the next
     shadow: float
     shadow_color: Tensor
-    lashes: bool
+    lashes: bool  # dark ones, or none that show
     hairdo: Hairdo
-    hat: Tensor | None
+    hat: Tensor | None  # the colour of a cap instead of hair
+    # Half their width and height, millimetres, grey and thickness (pixels) of the frame, how dark the lenses are.
     glasses: tuple[float, float, float, float, float] | None
     seed: int
 

@@ -33,16 +33,10 @@ class TakeInputs:
 
 @dataclass(frozen=True)
 class TakeOutputs(WeightFiles):
-    """What becomes of a solved take.
+    """What becomes of a solved take."""
 
-    Args:
-        out, animation, live_link, reduce: see :class:`~torchface.workflows.weight_files.WeightFiles`.
-        report: a folder for a page, if wanted.
-        stream: an address that the solved weights are sent to in their own time, if wanted.
-    """
-
-    report: Path | None = None
-    stream: str | None = None
+    report: Path | None = None  # a folder for a page
+    stream: str | None = None  # an address that the solved weights are sent to in their own time
 
 
 def solve_take(
