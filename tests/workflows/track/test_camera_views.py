@@ -12,7 +12,8 @@ import torch
 from torch import Tensor
 
 from planted.light_stage import LightStageSettings, render_lit_video
-from torchface import BlendshapeRig, load_rig, save_rig
+from torchface import BlendshapeRig, load_rig, load_take, save_rig
+from torchface.cli import main
 from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
 from torchface.geometry.cameras.calibration import CameraCalibration, PlacedCamera
 from torchface.geometry.rotations import rotation_matrix
@@ -109,6 +110,22 @@ def test_a_second_camera_shows_what_the_first_does_not_see(
     one = (track(films, tmp_path / "one") - truth).abs()
     assert float(both[2:].mean()) < 0.12 < 0.3 < float(one[2:].mean())  # the right one sees from frame 2 on
     assert float(both[4:7].mean()) < 0.12
+
+
+def test_the_command_line_takes_a_film_of_each_camera(
+    films: Path, planted: dict[str, Tensor], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The first film shows no mouth: without the second one its shapes would be unknown."""
+    planted["left"][:, 48:] = torch.nan
+    words = ["--video", films / "left.avi", "--video", films / "right.avi", "--cameras", films / "cameras.toml"]
+    words += ["--rig", films / "rig.glb", "--out", tmp_path / "out", "--prior", "none", "--overlay", "none"]
+    main(["track", *map(str, words), "--one-person", "--whole-take"])
+    assert "camera right: right.avi, 289 mm from the first" in " ".join(capsys.readouterr().err.split())
+    take = load_take(tmp_path / "out" / "weights.csv")
+    assert take.weights is not None
+    rate, frames, _ = FILMS["left"]
+    found = take.weights.select(NAMES).values[2:, :, 0]
+    assert float((found - performed(torch.arange(frames) / rate)[2:]).abs().mean()) < 0.12
 
 
 def test_films_are_brought_together_by_timecodes(ready: TrackInputs, tmp_path: Path) -> None:
