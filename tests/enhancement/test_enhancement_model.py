@@ -1,7 +1,6 @@
 """What holds of an actor's model: its own frames come back, motion goes along, bad input is told."""
 
 import copy
-import errno
 import math
 from dataclasses import replace
 
@@ -9,7 +8,7 @@ import pytest
 import torch
 
 from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
-from torchface.errors import AlignmentError, FileFormatError, TopologyError, ValueRangeError
+from torchface.errors import AlignmentError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.operators import border_vertices
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
@@ -189,21 +188,6 @@ def test_frames_on_disk_give_the_same_model(model, database, tmp_path):
         CapturedPerformance(sequence, database.faces, database.sequences, database.neutral), rank=36, patch_size=20
     )
     assert torch.equal(found(database.smooth[3:5]), model(database.smooth[3:5]))
-
-
-def test_a_full_disk_is_told_and_leaves_what_was_there(database, tmp_path, monkeypatch):
-    monkeypatch.setattr("torchface.enhancement.enhancement_training._SECONDS", 0.0)
-
-    def full(handle, data):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr("torchface.files.whole_files.os.write", full)
-    with pytest.raises(FileFormatError, match="the disk is full"):
-        EnhancementModel.fit(
-            CapturedPerformance(database.frames, database.faces, database.sequences, database.neutral),
-            rank=6,
-            folder=tmp_path,
-        )
 
 
 def test_what_is_not_of_this_mesh_or_unit_is_refused(model, database):

@@ -1,14 +1,10 @@
-"""Runs in a forked process of a test: one that is killed in its middle, one that holds a folder of results."""
+"""A run in a forked process of a test that is killed in its middle."""
 
 import os
 import signal
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Callable
 
 import torch
-
-from torchface.files.job_lock import job_lock
 
 _SECONDS = 120  # after which a child is ended that does not come to its step
 
@@ -29,25 +25,3 @@ def killed(work: Callable[[Callable[..., None]], object], step: str, done: int) 
         finally:
             os._exit(1)
     assert os.waitstatus_to_exitcode(os.waitpid(process, 0)[1]) == -signal.SIGKILL
-
-
-@contextmanager
-def held(folder: Path) -> Iterator[int]:
-    """Another process holds the folder, as a run does; its number."""
-    read, write = os.pipe()
-    process = os.fork()
-    if process == 0:
-        try:
-            with job_lock(folder):
-                os.write(write, b"held")
-                signal.pause()
-        finally:
-            os._exit(1)
-    try:
-        assert os.read(read, 4) == b"held"
-        yield process
-    finally:
-        os.kill(process, signal.SIGKILL)
-        os.waitpid(process, 0)
-        os.close(read)
-        os.close(write)

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from forked_runs import held, killed
+from forked_runs import killed
 from scipy.spatial.transform import Rotation
 
 from planted.published_heads import gnm_arrays, gnm_landmarks, head
@@ -157,14 +157,6 @@ def test_a_killed_run_goes_on_where_it_was(
     again = train(settings)
     assert read[11:] == [0]
     assert torch.equal(again.model.shape.components, trained[0].model.shape.components)
-
-
-def test_another_run_into_the_folder_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    out = tmp_path / "people"
-    with held(out) as process, pytest.raises(SystemExit):
-        recipe.RECIPE.main(["--performers", "6", "--out", str(out)])
-    assert f"another run writing into {out} (process {process} on " in " ".join(capsys.readouterr().err.split())
-    assert not (tmp_path / ".people.training").exists()
 
 
 def test_meshes_that_teach_nothing_are_named(heads: list[Mesh], tmp_path: Path, without_pictures: None) -> None:

@@ -68,30 +68,6 @@ def test_passes_give_the_same_as_in_memory_and_go_on_where_they_were(
     assert not (tmp_path / "check").exists()
 
 
-def test_a_stopped_fit_continues(values: torch.Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(module, "_BLOCK_BYTES", 8 * 60 * 13)
-
-    def stop(step: str, done: int = 0, total: int = 0) -> None:
-        if done == total - 9:
-            raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        MorphableModel.fit(InMemory(values), 10, tmp_path / "check", stop)
-    finished = sorted((tmp_path / "check").glob("gram_*.safetensors"))
-    assert len(finished) == 6
-    finished[1].write_bytes(finished[1].read_bytes()[:-8])  # this one is computed again
-    again, whole = InMemory(values), InMemory(values)
-    ours, theirs = MorphableModel.fit(again, 10, tmp_path / "check"), MorphableModel.fit(whole, 10)
-    assert again.read_count < whole.read_count - 10
-    assert torch.equal(ours.components, theirs.components)
-    assert not (tmp_path / "check").exists()
-    with pytest.raises(KeyboardInterrupt):
-        MorphableModel.fit(InMemory(values), 10, tmp_path / "check", stop)
-    other = MorphableModel.fit(InMemory(2 * values), 10, tmp_path / "check")
-    assert torch.allclose(other.mean, 2 * ours.mean)
-    assert torch.allclose(other.standard_deviations, 2 * ours.standard_deviations, rtol=1e-5)
-
-
 def test_a_killed_fit_gives_the_same_and_never_takes_the_rows_of_others(
     values: torch.Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -364,11 +364,3 @@ def test_every_input_is_in_the_key(template: Mesh, tmp_path: Path, monkeypatch: 
     monkeypatch.setattr(content_keys, "__version__", "0.0.0")
     keys.append(key(job))
     assert len(set(keys)) == len(keys)
-
-
-def test_two_runs_do_not_write_into_one_folder(template: Mesh, scans: Path, done: BatchReport) -> None:
-    def second(entry: Outcome) -> None:
-        with pytest.raises(ValueRangeError, match="another run writing"):
-            run(template, scans, done.out)
-
-    run(template, scans, done.out, finished=second)

@@ -5,11 +5,10 @@ from pathlib import Path
 
 import pytest
 import torch
-from forked_runs import held, killed
+from forked_runs import killed
 from safetensors.torch import load_file
 
-from tests.workflows.track.conftest import FRAMES, PIECE, QUICK, Done, Filmed
-from torchface.errors import ValueRangeError
+from tests.workflows.track.conftest import FRAMES, PIECE, Done, Filmed
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.video import open_video
 from torchface.landmarks import FaceReading, LandmarkTracker
@@ -92,14 +91,6 @@ def test_damaged_files_are_told_and_made_anew(
             torch.testing.assert_close(ours, theirs, rtol=0, atol=0, equal_nan=True)
         else:
             assert_same_file(out / name, done.out / name)
-
-
-def test_another_run_into_the_folder_is_refused(done: Done, filmed: Filmed, tmp_path: Path) -> None:
-    with (
-        held(tmp_path / "out") as process,
-        pytest.raises(ValueRangeError, match=rf"another run writing into .*out \(process {process} on "),
-    ):
-        track_video(filmed.video, filmed.rig, tmp_path / "out", QUICK)
 
 
 def test_pieces_of_other_runs_and_damaged_ones_are_thrown_away(tmp_path: Path) -> None:

@@ -68,26 +68,6 @@ def test_a_network_of_another_size_computes_the_same() -> None:
         torch.testing.assert_close(found, expected, rtol=0, atol=0)
 
 
-def test_a_run_that_was_stopped_ends_as_one_that_was_not(pictures: tuple[torch.Tensor, ...], tmp_path) -> None:
-    settings = NetworkSettings(steps=6, batch=8, workers=0, checkpoint_every=0)
-
-    def trained(stop_at: int | None) -> dict[str, torch.Tensor]:
-        def stop(_: str, done: int = 0, total: int = 0) -> None:
-            if done == stop_at:
-                raise KeyboardInterrupt
-
-        torch.manual_seed(1)
-        start = LandmarkNetwork(**SMALL)
-        return LandmarkNetwork.fit(TensorDataset(*pictures), start, settings, stop, tmp_path / "part").state_dict()
-
-    with pytest.raises(KeyboardInterrupt):
-        trained(5)
-    resumed = trained(None)
-    (tmp_path / "part").unlink()
-    for name, value in trained(None).items():
-        torch.testing.assert_close(resumed[name], value, rtol=0, atol=0, msg=name)
-
-
 def test_augmented_landmarks_stay_on_what_they_mark() -> None:
     landmarks = torch.rand(40, 68, 2, generator=torch.Generator().manual_seed(2)) * 60 + 66
     y, x = torch.meshgrid(torch.arange(192.0), torch.arange(192.0), indexing="ij")
