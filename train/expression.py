@@ -10,11 +10,13 @@ import torch
 from torch import Tensor
 
 from torchface import BlendshapeRig, TorchfaceError, load_rig, zoo
+from torchface.errors import NameMismatchError
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import make_folder
 from torchface.geometry.similarity import similarity_transform
 from torchface.modeling import ExpressionRegression, ExpressionSettings
 from torchface.progress import Progress
+from torchface.registration.own_topology import check_triangles
 from torchface.rendering.compositing import save_rendered_image
 from torchface.synthetic import draw_identities, performer
 
@@ -77,7 +79,7 @@ def train(settings: Settings, run: Run) -> Trained:
     progress(f"{len(people.who)} people, {len(people.names)} expressions")
     comparison = None
     if settings.compared:
-        template = None if settings.template is None else load_rig(settings.template)
+        template = None if settings.template is None else _template(settings.template, people)
         comparison = compare(people, lambda rest: fit(rest, settings, progress), template, settings.pictured, progress)
     model = fit(people, settings, progress)
     if comparison is not None:
@@ -85,6 +87,13 @@ def train(settings: Settings, run: Run) -> Trained:
         model.errors.copy_(comparison.expected())
     save(model, people, comparison, settings)
     return Trained(model, comparison)
+
+
+def _template(path: Path, people: People) -> BlendshapeRig:
+    """The people's expressions of a rig of their topology."""
+    rig = load_rig(path)
+    check_triangles(people.template, rig.neutral, str(path), people.who[0])
+    return selected(rig, people.names, path)
 
 
 def fit(people: People, settings: Settings, progress: Progress | None = None) -> ExpressionRegression:
@@ -109,7 +118,7 @@ def gather(settings: Settings, work: Path, progress: Progress) -> People:
         identities = draw_identities(settings.performers, torch.Generator().manual_seed(settings.seed))
         return gather_people(
             [f"performer{number:03d}" for number in range(settings.performers)],
-            lambda number: selected(performer(identities[number], texture=False), settings.expressions),
+            lambda number: selected(performer(identities[number], texture=False), settings.expressions, "performers"),
             lambda number: content_key(_METHOD, identity=identities[number], expressions=settings.expressions),
             work,
             "performers",
@@ -143,18 +152,26 @@ def entries(folder: Path) -> list[Path]:
 
 def read(path: Path, settings: Settings) -> BlendshapeRig:
     """One person's expressions, aligned with the neutral."""
-    rig = selected(load_rig(path), settings.expressions)
+    rig = selected(load_rig(path), settings.expressions, path)
     if not settings.align:
         return rig
     settled = [settle(rig.vertices, rig.vertices + delta) - rig.vertices for delta in rig.deltas]
     return BlendshapeRig(rig.neutral, torch.stack(settled), rig.names)
 
 
-def selected(rig: BlendshapeRig, expressions: tuple[str, ...]) -> BlendshapeRig:
-    """The rig of these expressions; with a plus sign between shapes, their sum."""
+def selected(rig: BlendshapeRig, expressions: tuple[str, ...], source: Path | str) -> BlendshapeRig:
+    """The rig of these expressions; one with plus signs that is no shape itself is the sum of the shapes between."""
     if not expressions:
         return rig
-    deltas = [rig.deltas[rig.index(expression.split("+"))].sum(0) for expression in expressions]
+    parts = [[name] if name in rig.names else name.split("+") for name in expressions]
+    lacking = list(dict.fromkeys(part for some in parts for part in some if part not in rig.names))
+    if lacking:
+        shown = ", ".join(rig.names[:5]) + (", ..." if len(rig.names) > 5 else "")
+        raise NameMismatchError(
+            f"{source}: found no shape {', '.join(map(repr, lacking))} among {len(rig.names)} ({shown}), expected "
+            f"those of {', '.join(expressions)}; choose by --expressions what it has, or give another file"
+        )
+    deltas = [rig.deltas[rig.index(some)].sum(0) for some in parts]
     return BlendshapeRig(rig.neutral, torch.stack(deltas), expressions)
 
 

@@ -90,7 +90,7 @@ def compare(
     for row, i in enumerate(tested):
         if learned is None or count <= _MANY:
             learned = _learned(people.without(i) if count <= _MANY else people.first(tested.start), fit)
-        source = learned.mean if template is None else template.select(people.names)
+        source = learned.mean if template is None else template
         neutral, offsets = people.neutral(i), people.offsets_of(i)
         predictions = torch.stack(
             [

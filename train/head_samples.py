@@ -8,17 +8,15 @@ from pathlib import Path
 import torch
 
 from torchface import Mesh, load_mesh
-from torchface.errors import FileFormatError, TopologyError
+from torchface.errors import FileFormatError
 from torchface.files.content_keys import content_key
 from torchface.geometry.meshes.unit_check import check_unit, extent
-from torchface.geometry.meshes.vertex_order import KEEP_ORDER
 from torchface.geometry.sample_batches import Samples, blocks
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io import MeshSequence, MeshSequenceWriter
 from torchface.io.meshes.named_files import named_files
-from torchface.mesh import other_topology
 from torchface.progress import Progress
-from torchface.registration.own_topology import check_own_topology
+from torchface.registration.own_topology import check_own_topology, check_triangles
 from torchface.rendering.clay_shading import sample_texture
 from torchface.synthetic import draw_identities, neutral_head
 from torchface.workflows.batch.batch_items import find_items
@@ -105,7 +103,7 @@ def gather(source: Source, held_out: int, work: Path, template: Mesh | None, pro
     with shapes, colors:
         for number in range(min(shapes.done, colors.done) if colored else shapes.done, count):
             mesh = first if number == 0 else source.read(number)
-            _check_topology(mesh, template, source.names[number], name)
+            check_triangles(template, mesh, source.names[number], name)
             used = mesh.vertices[mesh.faces.flatten()]
             check_unit(source.names[number], used, size_of_template, "a template", _LEAST_EXTENT, _MOST_EXTENT)
             check_own_topology(template, mesh, source.names[number], name)
@@ -120,16 +118,6 @@ def gather(source: Source, held_out: int, work: Path, template: Mesh | None, pro
     return Gathered(
         source.names, template, MeshSequence(files[0]), MeshSequence(files[1]) if colored else None, held_out
     )
-
-
-def _check_topology(mesh: Mesh, template: Mesh, name: str, owner: str) -> None:
-    """Refuses a mesh of other triangles."""
-    counts = [(len(one.vertices), len(one.faces)) for one in (mesh, template)]
-    if counts[0] != counts[1]:
-        found, expected = ("{} vertices and {} triangles".format(*count) for count in counts)
-        raise TopologyError(f"{name}: found {found}, expected those of {owner}, {expected}")
-    if mesh.fingerprint() != template.fingerprint():
-        raise TopologyError(f"{name}: found {other_topology(mesh.fingerprint(), template, owner)}; {KEEP_ORDER}")
 
 
 def _kept(path: Path, key: str, count: int) -> MeshSequence | None:

@@ -1,18 +1,19 @@
 """The recipe for expressions on a handful of domes: a folder of pairs in, a table and a model out."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from torchface import BlendshapeRig, TorchfaceError, load_rig, save_mesh, save_rig, zoo
-from torchface.errors import NameMismatchError
+from torchface import BlendshapeRig, Mesh, TorchfaceError, load_rig, save_mesh, save_rig, zoo
+from torchface.errors import NameMismatchError, TopologyError
 from torchface.modeling import ExpressionRegression, ExpressionSettings
 from torchface.progress import silent
 from train import expression as recipe
 from train import expression_table, people_samples
-from train.expression import Settings, Trained, fit, gather, settle, train
+from train.expression import Settings, Trained, fit, gather, selected, settle, train
 from train.expression_table import METHODS
 
 
@@ -72,6 +73,35 @@ def test_the_model_lies_in_its_folder(trained: tuple[Trained, Path], dome_rig: B
     assert record.metrics["lowest error of 16 cases, share: regression"] >= 14 / 16
     assert "--expressions jawOpen mouthSmileLeft+mouthSmileRight" in record.recipe
     assert (out / "pictures" / "jawOpen.png").stat().st_size > 1000
+
+
+def test_a_template_gives_the_sum_where_people_have_a_combination(
+    pairs: Path, dome_rig: BlendshapeRig, tmp_path: Path
+) -> None:
+    both = "mouthSmileLeft+mouthSmileRight"
+    people = Settings(pairs=tmp_path / "people", template=tmp_path / "template.glb", out=tmp_path / "own", pictured=0)
+    people.pairs.mkdir()
+    for i in range(4):
+        person = people.pairs / f"person{i}"
+        person.mkdir()
+        shutil.copy(pairs / f"person{i}" / "neutral.obj", person)
+        shutil.copy(pairs / f"person{i}" / "mouthSmileLeft.obj", person / f"{both}.obj")
+    save_rig(dome_rig, people.template)
+    whole = selected(dome_rig, (both,), people.template)
+    assert torch.equal(whole.deltas[0], dome_rig.deltas[2] + dome_rig.deltas[3])
+    save_rig(whole, tmp_path / "combined.glb")
+    found = [train(replace(people, template=tmp_path / f"{name}.glb")) for name in ("template", "combined")]
+    assert found[0].comparison.names == (both,)
+    torch.testing.assert_close(found[0].comparison.squared, found[1].comparison.squared, rtol=1e-5, atol=0)
+    save_rig(dome_rig.select(["jawOpen", "mouthSmileLeft"]), people.template)
+    with pytest.raises(NameMismatchError, match=r"template\.glb: found no shape 'mouthSmileRight' among 2"):
+        train(people)
+    save_rig(
+        BlendshapeRig(Mesh(dome_rig.vertices, dome_rig.neutral.faces[2:]), dome_rig.deltas, dome_rig.names),
+        people.template,
+    )
+    with pytest.raises(TopologyError, match=r"template\.glb: found 625 vertices and .* expected those of person0"):
+        train(people)
 
 
 def test_expressions_are_laid_onto_neutrals(dome_rig: BlendshapeRig) -> None:
