@@ -1,10 +1,13 @@
 """Cuts: found between two pictures, and not where somebody moves, light changes or a camera shakes."""
 
+import itertools
+
 import pytest
 import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from planted.crossing_people import crossing_film
 from torchface.landmarks.images.picture_cut import cut_between, small_copy
 
 
@@ -30,6 +33,18 @@ def test_where_pictures_change_all_the_time_a_cut_changes_more() -> None:
     _, change = cut_between(small_copy(wall(0)), small_copy(wall(1)), torch.tensor(0.0))
     assert not is_cut(wall(0), wall(1), float(change) / 3.9)
     assert is_cut(wall(0), wall(1), float(change) / 4.1)
+
+
+def test_who_passes_close_to_a_slow_camera_is_no_cut() -> None:
+    """Ten pictures a second, of a face that fills a plain picture's middle."""
+    frames = crossing_film(hidden=0.2, larger=1.4).frames.permute(0, 2, 3, 1)[::3, 20:220, 110:300]
+    copies, change = [small_copy(frame) for frame in frames], torch.tensor(0.0)
+    largest = 0.0
+    for before, after in itertools.pairwise(copies):
+        cut, change = cut_between(before, after, change)
+        assert not cut
+        largest = max(largest, float(change))
+    assert largest > 0.5
 
 
 @pytest.mark.parametrize("size", [(5, 7), (64, 64), (1080, 1920)])
