@@ -193,8 +193,8 @@ class FaceReader(nn.Module):
         anchor = torch.where(good & ~followed, relation(own, shown), anchor)
         people = after_face(people, own, appearance, (good, stranger & (followed | there)), interval)
         own = torch.where(good, own, place * ~cut)
-        seen = [size, people, picture.flatten(), change[None]]
-        after = torch.cat([own, anchor, torch.stack(counts), *seen])
+        shown_last = [size, people, picture.flatten(), change[None]]
+        after = torch.cat([own, anchor, torch.stack(counts), *shown_last])
         face = read_eyes(image, looked, self.eyes)
         nothing = dict.fromkeys(("landmarks", "iris", "openness", "closed", "expression"), torch.nan)
         nothing |= dict.fromkeys(("visibility", "presence", "eye_visibility"), 0.0)
