@@ -22,11 +22,12 @@ from torchface.synthetic import draw_identities, performer
 
 from .expression_table import Comparison, compare, picture
 from .model_cards import model_card
-from .people_samples import People
+from .people_samples import People, warn_of_exchanged
 from .people_samples import gather as gather_people
 from .recipe_settings import RecipeSettings
 from .runner import Recipe, Run, recipe
 
+_LEAST = 3  # people
 _METHOD = "a person's expressions/1"
 # Of the robust alignment, millimetres: how far off counts half, round by round, and what is too little to move.
 _HALF_AT, _LEAST_MOTION = (3.0, 2.0, 1.4, 1.0, 0.7, 0.5, 0.35, 0.25, 0.2, 0.2, 0.2, 0.2, 0.2, 0.2), 0.01
@@ -76,6 +77,8 @@ def train(settings: Settings, run: Run) -> Trained:
     """Gathers on disk, aligned, leaves one out after the other, fits, saves."""
     progress = run.progress
     people = gather(settings, run.work, progress)
+    if settings.pairs is not None:
+        warn_of_exchanged(people, str(settings.pairs))
     progress(f"{len(people.who)} people, {len(people.names)} expressions")
     comparison = None
     if settings.compared:
@@ -115,6 +118,8 @@ def gather(settings: Settings, work: Path, progress: Progress) -> People:
             "found neither --pairs nor --performers, or both; expected one: --pairs DIR or --performers COUNT"
         )
     if settings.pairs is None:
+        if settings.performers < _LEAST:
+            raise TorchfaceError(f"--performers: found {settings.performers}, expected at least {_LEAST}")
         identities = draw_identities(settings.performers, torch.Generator().manual_seed(settings.seed))
         return gather_people(
             [f"performer{number:03d}" for number in range(settings.performers)],
@@ -143,10 +148,9 @@ def entries(folder: Path) -> list[Path]:
         raise TorchfaceError(f"{folder}: found no such folder, expected one with an entry a person")
     shown = (path for path in folder.iterdir() if path.name[0] != ".")
     entries_found = sorted(path for path in shown if path.is_dir() or path.suffix in (".glb", ".gltf"))
-    if len(entries_found) < 3:
-        raise TorchfaceError(
-            f"{folder}: found {len(entries_found)} people, expected at least three: a .glb or a folder each"
-        )
+    if len(entries_found) < _LEAST:
+        people = "1 person" if len(entries_found) == 1 else f"{len(entries_found)} people"
+        raise TorchfaceError(f"{folder}: found {people}, expected at least three: a .glb or a folder each")
     return entries_found
 
 

@@ -136,6 +136,15 @@ def test_a_model_of_another_kind_is_named_by_the_flag_that_gave_it(
     assert f"error: {said}" in capsys.readouterr().err
 
 
+def test_a_folder_that_was_given_keeps_its_name_beside_a_flag_of_the_same_value(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("sys.argv", ["torchface", "train", "expression", "--pairs", "people", "--pictured", "1"])
+    with pytest.raises(SystemExit), plain_errors():
+        raise FileFormatError("people: found 1 person, expected at least three")
+    assert "error: people: found 1 person" in capsys.readouterr().err
+
+
 def test_a_warning_is_one_line_without_the_sources_path() -> None:
     as_before = warnings.formatwarning
     said = UserWarning("hat.vrm: left out:\nlights \x1b[2J")

@@ -1,6 +1,7 @@
 """The recipe for expressions on a handful of domes: a folder of pairs in, a table and a model out."""
 
 import shutil
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -132,8 +133,56 @@ def test_people_who_do_not_fit_are_named(pairs: Path, dome_rig: BlendshapeRig, t
         if i == 2:
             neutral = replace(neutral, faces=neutral.faces[:-2], polygons=None)
         save_rig(BlendshapeRig(neutral, dome_rig.deltas, dome_rig.names), tmp_path / f"{i}.glb")
-    with pytest.raises(TorchfaceError, match=r"found 2\.glb of topology"):
+    with pytest.raises(TorchfaceError, match=r": 2\.glb: found 625 vertices and .* expected those of 0\.glb"):
         train(Settings(pairs=tmp_path, out=tmp_path.parent / "own"))
+
+
+def people_of(rigs: list[BlendshapeRig], folder: Path) -> Settings:
+    """Settings for people of these rigs, p0 on, that learn nothing but what is needed."""
+    folder.mkdir(exist_ok=True)
+    for i, rig in enumerate(rigs):
+        save_rig(rig, folder / f"p{i}")
+    return Settings(pairs=folder, out=folder.parent / "own", compared=False)
+
+
+def test_a_persons_unit_hand_order_and_names_are_said_with_the_person(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    vertices, names = dome_rig.vertices + torch.tensor([0, 0, 0.2]) * dome_rig.vertices[:, :1], dome_rig.names
+    people = [
+        BlendshapeRig(dome_rig.neutral.with_vertices(vertices * height), dome_rig.deltas, names)
+        for height in (0.9, 1.0, 1.1, 1.2)
+    ]
+    mirror = torch.tensor([-1.0, 1.0, 1.0])
+    neutral = people[2].neutral
+
+    def asked(other: BlendshapeRig, folder: str) -> Settings:
+        return people_of([*people[:2], other, people[3]], tmp_path / folder)
+
+    def named(*new: str) -> BlendshapeRig:
+        return BlendshapeRig(neutral, dome_rig.deltas, new)
+
+    for changed, expected in (
+        (lambda points: 1e-3 * points, r"p2: found an extent of .* in metres \(scale this one by 1000\)"),
+        (lambda points: points * mirror, "p2: found a mirror image of p0's"),
+    ):
+        other = BlendshapeRig(neutral.with_vertices(changed(vertices)), changed(dome_rig.deltas), names)
+        with pytest.raises(TorchfaceError, match=expected) as raised:
+            train(asked(other, "wrong"))
+        assert "--unit" not in str(raised.value)
+        shutil.rmtree(tmp_path / "wrong")
+    with pytest.raises(
+        TorchfaceError, match=r"all 4 people have.*: p2 lacks browInnerUp, .*\(it has a1, a2, a3, a4 inst"
+    ):
+        train(asked(named("a1", "a2", "a3", "a4"), "foreign"))
+    with pytest.warns(UserWarning, match=r"jawOpen left out: p2 lacks jawOpen \(it has jawopen instead\)"):
+        assert len(train(asked(named("jawopen", *names[1:]), "lacking")).model.names) == 3
+    with pytest.warns(UserWarning, match="p2 moves unlike .*jawOpen as their browInnerUp .*, browInnerUp as their jaw"):
+        train(asked(named(names[1], names[0], *names[2:]), "exchanged"))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        train(people_of(people[:3], tmp_path / "good"))
+    for few in (0, 1, 2):
+        with pytest.raises(TorchfaceError, match=r"neither --pairs|found [12], expected at least 3"):
+            train(Settings(performers=few, out=tmp_path / "own"))
 
 
 def test_people_on_disk_give_what_people_in_memory_give(

@@ -136,7 +136,14 @@ def _by_flag(message: str, given: list[str]) -> str:
     words = [word for text in given for word in (text.split("=", 1) if text.startswith("--") else [text])]
     for flag, value in pairwise(words):
         starts = (f"{value},", f"{value} ", f"no {value!r}")
-        if found and argument.isidentifier() and flag.startswith("--") and value and rest.startswith(starts):
+        if (
+            found
+            and argument.isidentifier()
+            and argument not in words
+            and flag.startswith("--")
+            and value
+            and rest.startswith(starts)
+        ):
             return f"{flag}{found}{rest}"
     return message
 

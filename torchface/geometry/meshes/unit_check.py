@@ -23,15 +23,22 @@ def extent(points: Tensor) -> float:
     return float((points.amax(0) - points.amin(0)).double().norm())
 
 
-def check_unit(name: str, points: Tensor, beside: float, what: str, least: float, most: float) -> None:
-    """Refuses points whose extent is not ``least`` to ``most`` times that of ``what``, ``beside``, millimetres."""
+def check_unit(
+    name: str, points: Tensor, beside: float, what: str, least: float, most: float, alone: bool = False
+) -> None:
+    """Refuses points whose extent is not ``least`` to ``most`` times that of ``what``, ``beside``, millimetres.
+
+    ``alone``: others that are read with them have another unit, so that no option cures these.
+    """
     size = extent(points)
     ratio = size / max(beside, 1e-30)
     if least <= ratio <= most:
         return
     nearest = min(_UNITS, key=lambda unit: abs(math.log(max(ratio, 1e-30) / unit)))
     near = 1 / _NEAR < ratio / nearest < _NEAR
-    looks = "; it looks as if the lengths were {} ({})".format(*_UNITS[nearest]) if near else ""
+    unit, cure = _UNITS[nearest]
+    cure = f"scale this one by {1 / nearest:g}" if alone else cure
+    looks = f"; it looks as if the lengths were {unit} ({cure})" if near else ""
     raise ValueRangeError(
         f"{name}: found an extent of {size:.4g} mm beside {what} of {beside:.4g} mm{looks}; "
         "expected both in millimetres"

@@ -85,7 +85,7 @@ def _check_place(path: Path, neutral: Mesh, delta: Tensor) -> None:
     shape, across = rest + delta, extent(rest[used])
     if not across > 0:
         return
-    check_unit(str(path), shape[used], across, "the neutral", 1 / _LARGEST, _LARGEST)
+    check_unit(str(path), shape[used], across, "the neutral", 1 / _LARGEST, _LARGEST, alone=True)
     moved = delta[used].double()
     aside = moved.median(0).values
     together = float(((moved - aside).norm(dim=-1) < _STEADY * across).double().mean())
