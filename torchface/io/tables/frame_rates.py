@@ -74,7 +74,7 @@ def typical_rate(steps: np.ndarray) -> float:
     one_by_one = usual / 2 < middle < usual * (1 + _CLOSE) and near.mean() >= _EVENLY
     # How many frames each step is of, gradually from one number to the next: files round times differently.
     whole, part = np.divmod(steps / middle, 1) if one_by_one else (np.ones(count), 0.0)
-    frames = whole + np.clip((part - 0.35) / 0.3, 0, 1)
+    frames = whole + np.clip((part - 0.4) / 0.2, 0, 1)
     counted = _up_to(_MISSED * middle if one_by_one else PAUSE * usual, steps)
     if not one_by_one:  # after a pause nothing is made up for; what a network held back comes at once
         ends = np.minimum(np.arange(count) + np.maximum(steps / usual, 1), count).astype(int)
