@@ -1,4 +1,4 @@
-"""The painted pattern is what is bright in a region; a flow aligns it with another's."""
+"""The painted pattern is what is bright in a region, or dark in all; a flow aligns it with another's."""
 
 import pytest
 import torch
@@ -7,7 +7,7 @@ from torchface.capture.action_units import RegionVideo
 from torchface.capture.action_units.classifier_training import local_warps
 from torchface.capture.action_units.painted_pattern import aligned_grid, neutral_flow, otsu_threshold, pattern_levels
 from torchface.capture.action_units.painted_regions import region_grid, sample_regions
-from torchface.errors import ShapeError
+from torchface.errors import ShapeError, ValueRangeError
 
 
 def test_the_threshold_separates_planted_classes() -> None:
@@ -26,6 +26,26 @@ def test_paint_counts_by_how_much_of_a_pixel_it_covers() -> None:
     # Twice the exposure changes nothing.
     brighter = pattern_levels(2 * region, ["a"])
     torch.testing.assert_close(brighter.pattern(2 * probe), levels.pattern(probe))
+
+
+def test_dark_strokes_are_paint_too_and_lit_skin_beside_them_is_none() -> None:
+    region = torch.full((1, 40, 40), 0.6)
+    region[0, 5:9] = 0.05
+    levels = pattern_levels(region, ["a"])
+    assert levels.dark
+    probe = torch.tensor([[[0.9, 0.6, 0.05]]])
+    assert levels.pattern(probe).flatten().tolist() == [0, 0, 1]
+    region[0, 27:] = 0.9  # where the light falls
+    assert pattern_levels(region, ["a"]).dark
+    brow = 1 - region  # white strokes, and as much of a dark brow
+    levels = pattern_levels(brow, ["a"])
+    assert not levels.dark
+    assert levels.pattern(1 - probe).flatten().tolist() == [0, 0, 1]
+    both = torch.stack([region[0], brow[0]])
+    with pytest.raises(
+        ValueRangeError, match="found no painted pattern, brighter than the skin or darker: 0% of region 'c'"
+    ):
+        pattern_levels(torch.cat([both, torch.full((1, 40, 40), 0.5)]), ["a", "b", "c"])
 
 
 def test_a_flow_lays_one_pattern_on_another(regions: RegionVideo) -> None:

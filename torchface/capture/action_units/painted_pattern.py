@@ -1,4 +1,4 @@
-"""The painted pattern: segmented from the skin by brightness, and warped to another performer's.
+"""The painted pattern: segmented from the skin by its grey, and warped to another performer's.
 
 A dense flow between two performers' neutral images serves for every frame.
 """
@@ -19,6 +19,7 @@ Method = Literal["dis", "farneback"]
 _MIN_CONTRAST = 0.15
 _FRACTIONS = (0.01, 0.45)
 _MAX_PAINT = 0.35  # of a region; what is brighter than Otsu's threshold and covers more is skin beside hair or eyes
+_WORDS = {1.0: "is brighter", -1.0: "is darker"}
 _SOFTENING = 1.0  # pixels, standard deviation
 _FROM, _TO = 0.4, 0.9  # between skin, 0, and paint, 1: where the soft threshold begins and ends
 
@@ -30,11 +31,16 @@ class PatternLevels:
     skin: Tensor
     paint: Tensor
 
+    @property
+    def dark(self) -> bool:
+        """Whether paint is darker than the skin."""
+        return bool((self.paint < self.skin).all())
+
     def pattern(self, images: Tensor) -> Tensor:
         """The fraction of a pixel that is paint, (...,R,h,w) in [0,1].
 
-        A soft threshold between skin and paint, nearer to the paint because of highlights on the skin; partly covered
-        pixels count in part, so that motion of less than a pixel is kept.
+        A soft threshold between skin and paint, nearer to the paint because of highlights and shadows on the
+        skin; partly covered pixels count in part, so that motion of less than a pixel is kept.
         """
         skin, paint = self.skin[:, None, None], self.paint[:, None, None]
         fraction = (images - skin) / (paint - skin)
@@ -45,26 +51,39 @@ def pattern_levels(neutral: Tensor, names: Sequence[str]) -> PatternLevels:
     """The greys of skin and paint at rest, (R,h,w), by Otsu's threshold in each region, taken again where it found
     skin.
 
-    Source: Otsu 1979; thesis 4.1.9.
+    Paint is brighter than the skin in all regions, or darker in all: where both could be, what covers less with more
+    contrast, as strokes do, and not lit skin beside them, nor brows.
+
+    Source: Otsu 1979; thesis 4.1.9, whose paint is white.
     """
-    skin, paint = [], []
-    for name, region in zip(names, neutral, strict=True):
-        values = region.flatten()
-        threshold = otsu_threshold(values)
-        if float((values > threshold).float().mean()) > _MAX_PAINT:
-            threshold = otsu_threshold(values[values > threshold])
-        bright, dark = values[values > threshold], values[values <= threshold]
-        share = len(bright) / len(values)
-        contrast = float(bright.mean() - dark.mean()) if len(bright) and len(dark) else 0.0
-        if contrast < _MIN_CONTRAST or not _FRACTIONS[0] <= share <= _FRACTIONS[1]:
-            raise ValueRangeError(
-                f"region {name!r} shows no painted pattern: {share:.0%} of it is brighter than the rest by "
-                f"{contrast:.2f}, expected {_FRACTIONS[0]:.0%} to {_FRACTIONS[1]:.0%} brighter by "
-                f"{_MIN_CONTRAST} at least"
-            )
-        skin.append(dark.median())
-        paint.append(bright.median())
-    return PatternLevels(torch.stack(skin), torch.stack(paint))
+    found = dict[float, PatternLevels]()
+    faults = []
+    for sign in (1.0, -1.0):
+        skin, paint, contrast, share = torch.tensor([_region_levels(sign * region.flatten()) for region in neutral]).T
+        wrong = (contrast < _MIN_CONTRAST) | (share < _FRACTIONS[0]) | (share > _FRACTIONS[1])
+        if wrong.any():
+            first = int(wrong.nonzero()[0, 0])
+            faults.append(f"{share[first]:.0%} of region {names[first]!r} {_WORDS[sign]} by {contrast[first]:.2f}")
+        else:
+            found[float((contrast / share).median())] = PatternLevels(sign * skin, sign * paint)
+    if not found:
+        raise ValueRangeError(
+            f"found no painted pattern, brighter than the skin or darker: {faults[0]}, {faults[1]} than the rest; "
+            f"expected {_FRACTIONS[0]:.0%} to {_FRACTIONS[1]:.0%} of every region, by {_MIN_CONTRAST} at least"
+        )
+    return found[max(found)]
+
+
+def _region_levels(values: Tensor) -> tuple[float, float, float, float]:
+    """Of a region's pixels (N,) the greys of skin and of paint, which is brighter, by how much, and its share."""
+    threshold = otsu_threshold(values)
+    if float((values > threshold).float().mean()) > _MAX_PAINT:
+        threshold = otsu_threshold(values[values > threshold])
+    bright, dark = values[values > threshold], values[values <= threshold]
+    if not len(bright) or not len(dark):
+        return 0.0, 0.0, 0.0, 0.0
+    contrast = float(bright.mean() - dark.mean())
+    return float(dark.median()), float(bright.median()), contrast, len(bright) / len(values)
 
 
 def otsu_threshold(values: Tensor) -> float:

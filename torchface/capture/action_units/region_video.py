@@ -78,6 +78,8 @@ def read_regions(
     _check_length(video, labels, video.count)
     still = video.frame(labels.neutral)
     levels = pattern_levels(sample_regions(still[None].float() / 255, grid, _identity())[0], names)
+    if levels.dark:
+        progress(f"{video.path.name}: the paint is taken to be darker than the skin")
     neutral = levels.pattern(sample_regions(still[None].float() / 255, grid, _identity())[0])
     if reference is not None:
         grid = aligned_grid(grid, neutral_flow(neutral, reference, method))
