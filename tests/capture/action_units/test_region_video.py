@@ -44,3 +44,13 @@ def test_bad_input_is_named(session: RecordedSession, regions: RegionVideo, tmp_
     black = write_video([torch.zeros(labels.frames, 170, 128, dtype=torch.uint8)], tmp_path / "black.avi", 20.0)
     with pytest.raises(ValueRangeError, match="no painted pattern"):
         read_regions(black, labels, ["mouth"])
+
+
+def test_a_film_of_dark_paint_has_the_same_pattern(session: RecordedSession, regions: RegionVideo, tmp_path) -> None:
+    count = 8
+    frames = torch.stack([session.video.frame(t) for t in range(count)])
+    video = write_video([255 - frames], tmp_path / "dark.avi", 20.0)
+    labels = replace(session.labels, frames=count, neutral=0, performed=())
+    with pytest.warns(UserWarning, match=r"dark\.avi: the paint is taken to be darker than the skin"):
+        found = read_regions(video, labels, regions.names, size=regions.neutral.shape[-1])
+    assert (found.neutral - regions.neutral).abs().mean() < 0.02

@@ -1,5 +1,6 @@
 """From a head-camera video to stabilised images of its painted regions."""
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import islice
@@ -79,7 +80,7 @@ def read_regions(
     still = video.frame(labels.neutral)
     levels = pattern_levels(sample_regions(still[None].float() / 255, grid, _identity())[0], names)
     if levels.dark:
-        progress(f"{video.path.name}: the paint is taken to be darker than the skin")
+        warnings.warn(f"{video.path.name}: the paint is taken to be darker than the skin", stacklevel=2)
     neutral = levels.pattern(sample_regions(still[None].float() / 255, grid, _identity())[0])
     if reference is not None:
         grid = aligned_grid(grid, neutral_flow(neutral, reference, method))
