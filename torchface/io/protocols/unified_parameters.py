@@ -127,8 +127,8 @@ class UnifiedFace:
 
     def __init__(self) -> None:
         self.rotations = torch.zeros(len(ROTATIONS))  # Live Link Face's nine, radians
-        self._values = torch.zeros(2, len(UNIFIED.names))  # and whether they are known
-        self._ranks = [0] * len(UNIFIED.names)
+        self._values = [0.0] * len(UNIFIED.names)  # a list, whose numbers are set much faster than those of a tensor
+        self._ranks = [0] * len(UNIFIED.names)  # of what they came from; 0 until they are known
         self._angle_ranks = [0] * len(ROTATIONS)
 
     def take(self, name: str, value: float) -> bool:
@@ -139,7 +139,7 @@ class UnifiedFace:
         for row, factor in factors:
             if rank >= self._ranks[row]:
                 self._ranks[row] = rank
-                self._values[0, row], self._values[1, row] = max((value - rest) * factor, 0.0), 1.0
+                self._values[row] = max((value - rest) * factor, 0.0)
         for row, factor in _ANGLES.get(name, ()):
             if rank >= self._angle_ranks[row]:
                 self._angle_ranks[row] = rank
@@ -148,5 +148,5 @@ class UnifiedFace:
 
     def arkit(self) -> Tensor:
         """ARKit's weights (52,): of several twins the mean of those that are known."""
-        values, known = UNIFIED.to_arkit(self._values)
+        values, known = UNIFIED.to_arkit(torch.tensor([self._values, [float(rank > 0) for rank in self._ranks]]))
         return torch.where(known > 0, values / known, 0.0)
