@@ -16,6 +16,7 @@ from torchface.correctives.corrective_shapes import Corrective, Correctives
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.mesh import Mesh, submesh
 from torchface.number_checks import as_tensor, checked_type
+from torchface.optim.full_precision import full_precision
 from torchface.shape_names import arkit_sources, mapping
 from torchface.take import Track
 
@@ -165,6 +166,7 @@ class BlendshapeRig(nn.Module):
         )
         return self.without_correctives()
 
+    @full_precision
     def forward(self, weights: Tensor) -> Tensor:
         """Vertices (B,V,3) at weights (B,N), taken in the rig's dtype; NumPy's arrays and lists do as well."""
         weights = as_tensor("weights", weights, f"(B,{len(self.names)})").to(self.deltas.dtype)

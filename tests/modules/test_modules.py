@@ -321,6 +321,18 @@ def test_graphs_of_solvers_are_exported(kind: str) -> None:
         assert_same(tree_leaves(program.module()(*inputs)), tree_leaves(graph(*inputs)), 1e-5)
 
 
+NETWORKS = ("LandmarkNetwork", "BoxNetwork", "EyeNetwork", "PartNetwork")
+
+
+@pytest.mark.parametrize("name", [name for name in EXAMPLES if name not in NETWORKS])
+def test_autocast_has_no_effect_on_it(name: str) -> None:
+    example, module = EXAMPLES[name], EXAMPLES[name].make(0)
+    with torch.no_grad():
+        wanted = outputs(example, module, *example.inputs())
+        with torch.autocast("cpu", dtype=torch.bfloat16):
+            assert_same(outputs(example, module, *example.inputs()), wanted, 1e-5)
+
+
 class Called(nn.Module):
     """A network that holds the module."""
 

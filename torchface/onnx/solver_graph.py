@@ -9,6 +9,7 @@ from torchface.capture import MarkerSolver
 from torchface.capture.energy import Quadratic, pull_term
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.optim import FixedSplitting, ProjectedGradient
+from torchface.optim.full_precision import full_precision
 
 Program = FixedSplitting | ProjectedGradient
 
@@ -62,6 +63,7 @@ class SolverGraph(nn.Module):
         """Of the splitting's metric."""
         return self.complete.rho if isinstance(self.complete, FixedSplitting) else None
 
+    @full_precision
     def forward(
         self, markers: Tensor, previous: Tensor, predicted: Tensor | None = None, gamma: Tensor | None = None
     ) -> Tensor:

@@ -6,6 +6,7 @@ from torch import Tensor, nn
 from torchface.number_checks import as_tensor
 from torchface.optim.box_checks import check_vectors, checked_tolerance, default_tolerance
 from torchface.optim.data_dependent import data_dependent, is_transformed
+from torchface.optim.full_precision import full_precision
 from torchface.optim.implicit import BoxSolution
 from torchface.optim.prepared_program import PreparedProgram
 from torchface.optim.prepared_tensors import Prepared
@@ -13,6 +14,7 @@ from torchface.optim.prepared_tensors import Prepared
 _EXPORTED = "torchface.optim.ProjectedGradient, whose steps a graph can hold"
 
 
+@full_precision
 def box_qp(
     H: Tensor,
     f: Tensor,
@@ -113,6 +115,7 @@ class BoxQP(nn.Module):
         self._prepared: Prepared[PreparedProgram] = Prepared()
         self._prepared.get((self.H, self.lower, self.upper), lambda: prepared)
 
+    @full_precision
     def forward(self, f: Tensor, start: Tensor | None = None) -> Tensor:
         """The minimisers (B,N) for f (B,N), of H's dtype; ``start`` is an initial guess (B,N)."""
         f = as_tensor("f", f, "(B,N)", self.H.dtype)

@@ -8,6 +8,7 @@ import torch
 
 from torchface.errors import TraceError
 from torchface.number_checks import as_real
+from torchface.optim.full_precision import full_precision
 
 Given = ParamSpec("Given")
 Result = TypeVar("Result")
@@ -35,6 +36,7 @@ def data_dependent(instead: str) -> Callable[[Callable[Given, Result]], Callable
     """
 
     def marked(method: Callable[Given, Result]) -> Callable[Given, Result]:
+        method = full_precision(method)
         name = method.__qualname__.partition(".")[0].lstrip("_")
 
         @functools.wraps(method)

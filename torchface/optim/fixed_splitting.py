@@ -9,6 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.number_checks import checked_count, checked_number
+from torchface.optim.full_precision import full_precision
 from torchface.optim.operator_splitting import RELAXATION, RHO, prepare_splitting
 
 STEPS = 66
@@ -72,6 +73,7 @@ class FixedSplitting(nn.Module):
         self.register_buffer("minus_step", -step.float())
         self.register_buffer("double_step", double_step.float())
 
+    @full_precision
     def forward(self, f: Tensor, H: Tensor | None = None, start: Tensor | None = None) -> Tensor:
         """The solutions, (B,N), in the precision of the buffers.
 

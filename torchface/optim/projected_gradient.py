@@ -22,6 +22,7 @@ from torchface.number_checks import as_tensor, checked_count, checked_number
 from torchface.optim.box_checks import check_finite, check_vectors, checked_bounds, checked_hessian
 from torchface.optim.box_problem import metric
 from torchface.optim.data_dependent import is_transformed
+from torchface.optim.full_precision import full_precision
 from torchface.optim.implicit import free_step
 from torchface.optim.prepared_tensors import Prepared
 
@@ -107,6 +108,7 @@ class ProjectedGradient(nn.Module):
         self.register_buffer("lower", ends[0].to(like, copy=True))
         self.register_buffer("upper", ends[1].to(like, copy=True))
 
+    @full_precision
     def forward(self, f: Tensor, H: Tensor | None = None, start: Tensor | None = None) -> Tensor:
         """The minimisers (B,N), within the bounds exactly.
 

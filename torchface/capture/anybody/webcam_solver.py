@@ -29,6 +29,7 @@ from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
 from torchface.landmarks.images.face_reading import LEAST_VISIBLE, READ_FOR_SOLVER, FaceReading, trust_of
 from torchface.optim.exported_operators import symmetric_inverse
+from torchface.optim.full_precision import full_precision
 
 _SPLITTING_STEPS = 30
 _LEAST_TRUST = 8.0  # of landmarks that nothing hides, together
@@ -126,6 +127,7 @@ class WebcamSolver(WebcamSolverParts):
             after = self(*tensors, pixels, torch.tensor(float(interval)), asked, state.pack())
             return self.layout.unpack(after.clone())
 
+    @full_precision
     def forward(  # noqa: PLR0913  # the inputs of a graph are tensors by their names
         self,
         landmarks: Tensor,

@@ -12,6 +12,7 @@ from torchface.capture.priors.dynamics_prior import DynamicsPrior
 from torchface.capture.priors.motion_features import newest_frames, same_rate
 from torchface.capture.priors.name_translation import name_matrices, require_same_names
 from torchface.errors import FileFormatError, ValueRangeError
+from torchface.optim.full_precision import full_precision
 
 _MAX_RATIO = 8.0
 
@@ -80,6 +81,7 @@ class AdaptedDynamicsPrior(nn.Module):
         """Of the learned prior: its dtype and device are this one's."""
         return self.learned.center
 
+    @full_precision
     def forward(self, windows: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the next frame.
 

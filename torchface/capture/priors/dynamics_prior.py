@@ -15,6 +15,7 @@ from torchface.capture.priors.motion_noise import MotionNoise
 from torchface.capture.priors.name_translation import require_same_names
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
+from torchface.optim.full_precision import full_precision
 from torchface.progress import Progress
 
 _MAX_NUMBERS = 2**26
@@ -204,6 +205,7 @@ class DynamicsPrior(nn.Module):
             takes, names, window, fps=fps, groups=groups, input_noise=input_noise, settings=settings, progress=progress
         )
 
+    @full_precision
     def forward(self, windows: Tensor) -> tuple[Tensor, Tensor]:
         """Mean and variance of the next frame.
 

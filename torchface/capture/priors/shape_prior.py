@@ -17,6 +17,7 @@ from torchface.capture.priors.student_t import PARTING_VARIANCE, StudentDensity,
 from torchface.capture.priors.take_frames import TakeFrames
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_number, checked_type
+from torchface.optim.full_precision import full_precision
 
 _UPPER = re.compile(r"(eye|brow|pupil)", re.IGNORECASE)
 LearnedDensity = ParzenDensity | StudentDensity
@@ -30,6 +31,7 @@ STRENGTH = 0.15  # of a fitted prior: chosen by the error of solves of real take
 class Density(Protocol):
     """A density as a prior uses it; see ``StudentDensity`` and ``ParzenDensity``."""
 
+    @full_precision
     def log_density(self, samples: Tensor) -> Tensor:
         """(B,D) to (B,)."""
 
@@ -128,6 +130,7 @@ class ShapePrior(nn.Module):
         weights = self._checked(weights)
         return torch.stack([density.log_density(part) for density, part in self.parts(weights)]).sum(0)
 
+    @full_precision
     def energy(self, weights: Tensor) -> Quadratic:
         """The quadratic that touches the energy at weights (B,N) from above."""
         weights = self._checked(weights)
@@ -305,6 +308,7 @@ class ReciprocalPrior(ShapePrior):
         groups = face_halves(names) if groups is None else groups
         return cls(names, groups, [ParzenDensity.fit(together[:, list(group)], seed=seed) for group in groups])
 
+    @full_precision
     def energy(self, weights: Tensor) -> Quadratic:
         """The quadratic with the energy's value and slope at weights (B,N)."""
         weights = self._checked(weights)

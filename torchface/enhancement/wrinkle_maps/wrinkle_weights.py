@@ -10,6 +10,7 @@ from torch import Tensor, nn
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.number_checks import checked_count
 from torchface.optim.eigenpairs import largest_eigenpairs
+from torchface.optim.full_precision import full_precision
 from torchface.rig import BlendshapeRig
 
 SITES = 2000  # vertices that are looked at: of a face more would only say the same again
@@ -130,6 +131,7 @@ class WrinkleWeights(nn.Module):
         whole.sites, whole.vertex_count = vertices[self.sites], count
         return whole
 
+    @full_precision
     def forward(self, vertices: Tensor) -> Tensor:
         """Weights of the maps, (T,R,M), in [0,1], of the rig's vertices (T,V,3), millimetres, in any rigid place."""
         return self.of_moments(self.moments(vertices.index_select(1, self.sites) - self.neutral))
@@ -253,6 +255,7 @@ class RigWrinkles(nn.Module):
         corrected = None if extra is None else wrinkles.moments(extra[:, wrinkles.sites]).flatten(1)
         self.register_buffer("corrected", corrected)
 
+    @full_precision
     def forward(self, weights: Tensor) -> Tensor:
         """Weights of the maps, (T,R,M), of blendshape weights (T,N)."""
         change = weights @ self.moved

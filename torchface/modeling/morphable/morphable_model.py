@@ -13,6 +13,7 @@ from torchface.files.documents import Value
 from torchface.geometry.sample_batches import Samples, SamplesInMemory
 from torchface.modeling.morphable.principal_components import principal_components
 from torchface.number_checks import as_real, as_tensor
+from torchface.optim.full_precision import full_precision
 from torchface.progress import Progress
 
 _MAX_BYTES = 2**31
@@ -154,6 +155,7 @@ class MorphableModel(nn.Module):
         """The share of the total variance that the first components hold, (K,), rising."""
         return self.standard_deviations.double().square().cumsum(0) / self.total_variance.double()
 
+    @full_precision
     def forward(self, coefficients: Tensor) -> Tensor:
         """Coefficients (B,K) to samples (B,V,C)."""
         self._check(coefficients)
@@ -162,6 +164,7 @@ class MorphableModel(nn.Module):
         offset = scaled @ self.components.flatten(1).to(coefficients)
         return self.mean.to(coefficients) + offset.reshape(-1, *self.mean.shape)
 
+    @full_precision
     def project(self, samples: Tensor, vertices: Tensor | None = None, noise: float | Tensor | None = None) -> Tensor:
         r"""The coefficients that explain samples.
 

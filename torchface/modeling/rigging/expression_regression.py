@@ -13,6 +13,7 @@ from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import transfer_deformation
 from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_count, checked_number, checked_type
+from torchface.optim.full_precision import full_precision
 from torchface.progress import Progress
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
@@ -217,6 +218,7 @@ class ExpressionRegression(nn.Module):
         neutrals = as_real(neutrals, "neutrals")
         return neutrals[:, None] + self.offsets(neutrals)
 
+    @full_precision
     def offsets(self, neutrals: Tensor) -> Tensor:
         """How far each vertex goes in each expression, (B,N,V,3); see :meth:`forward`."""
         if neutrals.ndim != 3 or neutrals.shape[1:] != self.neutral_mean.shape:
@@ -233,6 +235,7 @@ class ExpressionRegression(nn.Module):
             whole = whole - aligned[:, None]
         return whole @ pose.rotation.to(whole)[:, None]
 
+    @full_precision
     def distance(self, neutrals: Tensor) -> Tensor:
         r"""How far from the people learned from neutral faces (B,V,3) are, (B,); NaN where the model is not judged.
 

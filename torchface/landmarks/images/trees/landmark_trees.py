@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.files.documents import Value
+from torchface.optim.full_precision import full_precision
 from torchface.progress import Progress
 
 if TYPE_CHECKING:
@@ -149,6 +150,7 @@ class LandmarkTrees(nn.Module):
         if not float((self.mean - self.mean.mean(0)).abs().max()) > 0:
             raise ValueRangeError("mean: found a single point, expected a shape")
 
+    @full_precision
     def forward(self, images: Tensor, boxes: Tensor) -> Tensor:
         """Landmarks (B,L,2), pixels.
 
@@ -165,6 +167,7 @@ class LandmarkTrees(nn.Module):
             raise ShapeError(f"boxes: found {tuple(boxes.shape)}, expected ({len(images)},4)")
         return self.refine(images, initial_shapes(self.mean, boxes.to(self.mean)))
 
+    @full_precision
     def refine(self, images: Tensor, shapes: Tensor) -> Tensor:
         """Landmarks (B,L,2) from other starts than the mean shape in a box, such as where they were a frame ago.
 
