@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.errors import ShapeError, TorchfaceError, ValueRangeError
-from torchface.optim import ProjectedGradient, box_qp
+from torchface.optim import FixedSplitting, ProjectedGradient, box_qp
 from torchface.optim.projected_gradient import largest_eigenvalue
 
 
@@ -162,6 +162,27 @@ def test_onnx_runtime_computes_the_same_in_a_loop(tmp_path: Path, own: bool) -> 
         np.testing.assert_allclose(found, module(*some).numpy(), atol=3e-6)
 
 
+def test_a_network_that_learns_is_written_as_it_is(tmp_path: Path) -> None:
+    network = nn.Sequential(nn.Linear(3, 5), ProjectedGradient(hessians(size=5).float(), steps=50)).eval()
+    features = torch.randn(4, 3, generator=torch.Generator().manual_seed(0))
+    torch.onnx.export(network, (features,), tmp_path / "network.onnx", dynamo=True, verbose=False)
+    session = onnxruntime.InferenceSession(tmp_path / "network.onnx", providers=["CPUExecutionProvider"])
+    (found,) = session.run(None, {session.get_inputs()[0].name: features.numpy()})
+    np.testing.assert_allclose(found, network(features).detach().numpy(), atol=3e-6)
+
+
+@pytest.mark.parametrize("layer", [ProjectedGradient, FixedSplitting])
+def test_bounds_keep_their_precision(layer: Any) -> None:
+    H = hessians(size=3)
+    low = torch.tensor([0.1, -torch.inf, 0.3], dtype=torch.float64)
+    f = 9 * slopes(6, 3, H=H).abs()
+    found = layer(H, low, 0.7, 300).double()(f)
+    assert (found[:, 2] == low[2]).any()
+    for one in (found, layer(None, low, 0.7, 300).double()(f, H)):
+        assert ((one >= low) & (one <= 0.7)).all()
+        torch.testing.assert_close(one, box_qp(H, f, low, 0.7), rtol=0, atol=1e-5)
+
+
 def test_the_eigenvalue_follows_h() -> None:
     layer = ProjectedGradient(hessians(size=5))
     assert set(layer.state_dict()) == {"H", "eigenvalue", "lower", "upper"}
@@ -178,7 +199,7 @@ def test_the_eigenvalue_follows_h() -> None:
         ({}, {"H": torch.diag(torch.tensor([0.0, 1.0]))}, ValueRangeError, r"rows \[0\] of H that are zero"),
         ({"H": torch.tensor([[1.0, 2.0], [2.0, 1.0]])}, None, ValueRangeError, "not positive semidefinite"),
         ({"H": torch.eye(2), "lower": torch.zeros(3)}, None, ShapeError, "ProjectedGradient: found lower"),
-        ({"lower": 2.0}, None, ValueRangeError, "expected the lower below"),
+        ({"lower": 2.0}, None, ValueRangeError, "lower 2.0 above upper 1.0"),
         ({"upper": torch.ones(3)}, {"H": torch.eye(2)}, ShapeError, "expected 3 columns"),
         ({"steps": -1}, None, ValueRangeError, "steps: found -1"),
         ({"tolerance": -1.0}, None, ValueRangeError, "tolerance: found -1"),
@@ -187,6 +208,7 @@ def test_the_eigenvalue_follows_h() -> None:
         ({}, {"H": torch.eye(2).double()}, ValueRangeError, "expected the same"),
         ({}, {"H": torch.full((2, 2), torch.nan)}, ValueRangeError, "H holds NaN"),
         ({}, {"H": torch.eye(2), "start": torch.zeros(3, 2)}, ShapeError, "found start"),
+        ({}, {"H": torch.diag(torch.tensor([2e-7, 2e9]))}, ValueRangeError, r"nearly so beside the .* 2e\+09"),
     ],
 )
 def test_bad_input_ends_in_what_was_found_and_expected(
@@ -194,3 +216,22 @@ def test_bad_input_ends_in_what_was_found_and_expected(
 ) -> None:
     with pytest.raises(error, match=says):
         ProjectedGradient(**made)(torch.zeros(2, 2), **(called or {}))
+
+
+@pytest.mark.parametrize(
+    ("made", "called", "error", "says"),
+    [
+        ({"H": torch.tensor([[1.0, 2.0], [2.0, 1.0]])}, {}, ValueRangeError, "not positive semidefinite"),
+        ({"lower": 1.0, "upper": 0.0}, {}, ValueRangeError, "lower 1.0 above upper 0.0"),
+        ({"lower": torch.zeros(2), "upper": torch.ones(3)}, {}, ShapeError, r"upper \(3,\), expected .* \(2,\)"),
+        ({}, {}, ShapeError, "found no H"),
+        ({"H": torch.eye(3)}, {}, ShapeError, r"f \(2, 2\), expected \(B,3\)"),
+        ({"H": torch.eye(2)}, {"f": torch.full((2, 2), torch.nan)}, ValueRangeError, r"rows \[0, 1\]"),
+        ({}, {"H": torch.full((2, 2), torch.nan)}, ValueRangeError, "H holds NaN"),
+    ],
+)
+def test_splitting_checks_the_same(
+    made: dict[str, Any], called: dict[str, Any], error: type[TorchfaceError], says: str
+) -> None:
+    with pytest.raises(error, match=f"FixedSplitting: .*{says}"):
+        FixedSplitting(**made)(**{"f": torch.zeros(2, 2), **called})

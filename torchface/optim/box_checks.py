@@ -10,6 +10,7 @@ from torchface.errors import ShapeError, ValueRangeError
 from torchface.number_checks import as_tensor, checked_number
 from torchface.optim.blas_threads import one_blas_thread
 from torchface.optim.box_problem import BoxProblem, check_box, metric
+from torchface.optim.data_dependent import is_recorded, is_transformed
 
 _TOLERANCE = {torch.float32: 3e-6, torch.float64: 1e-11}
 # A tolerance above it calls nearly every start a solution.
@@ -63,18 +64,26 @@ def _all_factor(H: Tensor, lift: Tensor) -> bool:
 
 
 def checked_bounds(
-    lower: float | Tensor, upper: float | Tensor, H: Tensor, name: str = "box_qp"
+    lower: float | Tensor, upper: float | Tensor, H: Tensor | None, name: str = "box_qp"
 ) -> tuple[Tensor, Tensor]:
-    variables = H.shape[-1]
-    bounds = []
-    for which, bound in (("lower", lower), ("upper", upper)):
-        if not isinstance(bound, Real):
-            bound = as_tensor(which, bound, "(N,), or a number")
-        bound = torch.as_tensor(bound, dtype=torch.float64, device=H.device).detach()
-        if bound.ndim and bound.shape != (variables,):
-            raise ShapeError(f"{name}: found {which} {tuple(bound.shape)}, expected a number or ({variables},)")
-        bounds.append(bound.expand(variables).contiguous())
-    low, high = bounds
+    """Bounds in float64, (N,); numbers alone stay numbers where there is no H yet."""
+    given = {"lower": lower, "upper": upper}
+    bounds = {
+        which: torch.as_tensor(
+            bound if isinstance(bound, Real) else as_tensor(which, bound, "(N,), or a number"),
+            dtype=torch.float64,
+            device=None if H is None else H.device,
+        ).detach()
+        for which, bound in given.items()
+    }
+    size = (
+        H.shape[-1:] if H is not None else next((one.shape for one in bounds.values() if one.ndim == 1), torch.Size())
+    )
+    for which, bound in bounds.items():
+        if bound.ndim and bound.shape != size:
+            wanted = size[0] if size else "N"
+            raise ShapeError(f"{name}: found {which} {tuple(bound.shape)}, expected a number or ({wanted},)")
+    low, high = (bound.expand(size).contiguous() for bound in bounds.values())
     check_box(name, low, high)
     return low, high
 
@@ -98,6 +107,24 @@ def check_vectors(H: Tensor, f: Tensor, start: Tensor | None, name: str = "box_q
         raise ValueRangeError(f"{name}: found f of {f.dtype} and H of {H.dtype}, expected the same")
     if start is not None and start.shape != f.shape:
         raise ShapeError(f"{name}: found start {tuple(start.shape)}, expected {tuple(f.shape)}")
+
+
+def as_vectors(which: str, values: Tensor, H: Tensor) -> Tensor:
+    """Vectors (B,N) as a tensor; whole numbers and what is none in the dtype of H."""
+    values = as_tensor(which, values, "(B,N)", H.dtype)
+    return values if values.is_floating_point() else values.to(H.dtype)
+
+
+def check_call(H: Tensor, f: Tensor, start: Tensor | None, name: str, lower: float | Tensor) -> None:
+    """Checks what a layer is called with; a graph and the transforms of ``torch.func`` cannot ask for numbers."""
+    if is_recorded() or is_transformed():
+        return
+    check_vectors(H, f, start, name)
+    check_finite(f, start, name)
+    if isinstance(lower, Tensor) and lower.ndim and len(lower) != f.shape[1]:
+        raise ShapeError(f"{name}: found f {tuple(f.shape)}, expected {len(lower)} columns, as of bounds")
+    if not _finite(H):
+        raise ValueRangeError(f"{name}: H holds NaN or infinite entries, expected finite ones")
 
 
 def check_finite(f: Tensor, start: Tensor | None, name: str = "box_qp") -> None:

@@ -84,9 +84,10 @@ class BoxProblem:
 
 
 def check_box(name: str, lower: Tensor, upper: Tensor) -> None:
-    """Checks bounds (N,): numbers, or infinite for none, and none above the other."""
+    """Checks bounds, (N,) or (): numbers, or infinite for none, and none above the other."""
     if bool(((lower <= upper) & (lower < torch.inf) & (upper > -torch.inf)).all()):
         return
+    lower, upper = lower.reshape(-1), upper.reshape(-1)
     for which, bound in (("lower", lower), ("upper", upper)):
         if torch.isnan(bound).any():
             raise ValueRangeError(f"{name}: {which} holds NaN, expected numbers or infinity")

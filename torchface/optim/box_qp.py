@@ -4,7 +4,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.number_checks import as_tensor
-from torchface.optim.box_checks import check_vectors, checked_tolerance, default_tolerance
+from torchface.optim.box_checks import as_vectors, check_vectors, checked_tolerance, default_tolerance
 from torchface.optim.data_dependent import data_dependent, is_transformed
 from torchface.optim.full_precision import full_precision
 from torchface.optim.implicit import BoxSolution
@@ -59,8 +59,8 @@ def box_qp(
         [[0.5, 1.0], [0.0, 0.5]]
     """
     H = as_tensor("H", H, "(N,N) or (B,N,N)")
-    f = as_tensor("f", f, "(B,N)", H.dtype)
-    start = None if start is None else as_tensor("start", start, "(B,N)", H.dtype)
+    f = as_vectors("f", f, H)
+    start = None if start is None else as_vectors("start", start, H)
     if is_transformed():
         return _transformed_minimiser(H, f, lower, upper, tolerance)
     return _box_qp(H, f, lower, upper, start, tolerance)
@@ -118,8 +118,8 @@ class BoxQP(nn.Module):
     @full_precision
     def forward(self, f: Tensor, start: Tensor | None = None) -> Tensor:
         """The minimisers (B,N) for f (B,N), of H's dtype; ``start`` is an initial guess (B,N)."""
-        f = as_tensor("f", f, "(B,N)", self.H.dtype)
-        start = None if start is None else as_tensor("start", start, "(B,N)", self.H.dtype)
+        f = as_vectors("f", f, self.H)
+        start = None if start is None else as_vectors("start", start, self.H)
         if is_transformed():
             return _transformed_minimiser(self.H, f, self.lower, self.upper, self.tolerance)
         return self._solved(f, start)

@@ -73,3 +73,8 @@ def is_transformed() -> bool:
     """
     # There is no public name for it.
     return not torch.compiler.is_dynamo_compiling() and torch._C._functorch.peek_interpreter_stack() is not None
+
+
+def is_recorded() -> bool:
+    """Whether a call becomes a graph, compiled or exported."""
+    return torch.compiler.is_compiling() or torch.compiler.is_exporting()

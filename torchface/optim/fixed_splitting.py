@@ -4,15 +4,20 @@ import math
 from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
+from numbers import Real
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from torchface.number_checks import checked_count, checked_number
+from torchface.errors import ShapeError
+from torchface.number_checks import as_tensor, checked_count, checked_number
+from torchface.optim.box_checks import check_call, checked_bounds, checked_hessian
 from torchface.optim.full_precision import full_precision
 from torchface.optim.operator_splitting import RELAXATION, RHO, prepare_splitting
 
 STEPS = 66
+_NAME = "FixedSplitting"
 _SMALLEST_DIAGONAL = 1e-6  # a share of the largest; smaller ones would overflow the scaling
 # Shares of the steps after which the constant is formed again from the gradient: early, so that what the inverse's
 # rounding left behind in slow modes is gone at the end.
@@ -21,7 +26,7 @@ _START = 1.5  # of Newton's iteration, over a norm; below 2 it converges
 
 
 class FixedSplitting(nn.Module):
-    r"""Solves box QPs to within some millionths by matrix products and clamps alone.
+    r"""Solves box QPs, not exactly, by matrix products and clamps alone.
 
     .. math:: \min \tfrac12 x^\top H x + f^\top x,\ l \le x \le u, \qquad
         v' = c - v\,G + z\,(2G + (2 - \alpha) I), \quad z' = \mathrm{clip}(v', l, u)
@@ -30,17 +35,21 @@ class FixedSplitting(nn.Module):
     here. Problems with an H each take Newton's iteration for the inverse of :math:`A = H + \rho D` scaled to a unit
     diagonal, :math:`X' = X (2I - AX)`: A's condition is at most about :math:`N / \rho`, so a dozen products suffice.
 
+    66 steps end where the objective is 1e-9 to 1e-4 of itself above the least, and weights are 1e-5 to 3e-2 off, most
+    where H is flat.
+
     The constant c is formed in the precision of f, float64, in which a shape that moves markers by hundredths of a
     millimetre is not lost beside others that move them by centimetres; the steps run in that of the buffers, float32.
 
     Args:
         H: of all problems, (N,N), positive semidefinite; absent if each call brings one a problem.
-        lower, upper: the box.
+        lower, upper: the box, numbers or (N,), infinite for none.
         steps: how many.
         rho: :math:`\rho`, of the metric.
 
     Raises:
-        ValueRangeError: less than one step, or a ``rho`` that is not positive.
+        ShapeError, ValueRangeError: H or the bounds are unfit, as for ``box_qp``, less than one step, or a ``rho`` that
+            is not positive.
 
     Source: Boyd et al. 2011, 3.4.3 and 5.2; Schulz 1933 for the inverse.
 
@@ -53,22 +62,38 @@ class FixedSplitting(nn.Module):
     offset: Tensor
     minus_step: Tensor
     double_step: Tensor
+    lower: Any  # a number or (N,)
+    upper: Any
 
     def __init__(
-        self, H: Tensor | None = None, lower: float = 0.0, upper: float = 1.0, steps: int = STEPS, rho: float = RHO
+        self,
+        H: Tensor | None = None,
+        lower: float | Tensor = 0.0,
+        upper: float | Tensor = 1.0,
+        steps: int = STEPS,
+        rho: float = RHO,
     ) -> None:
         super().__init__()
         checked_count("fixed splitting: steps", steps, 1)
-        self.lower, self.upper, self.steps, self.rho = lower, upper, steps, rho
+        self.steps, self.rho = steps, rho
         checked_number("fixed splitting: rho", rho, above=True)
         # A whole number, as a compiled call takes it for a constant.
         self._doublings = math.ceil(math.log2(16 / (_START * rho)))
         offset = step = torch.zeros(0, 0, dtype=torch.float64)
+        H = None if H is None else as_tensor("H", H, "(N,N)")
         if H is not None:
-            factors = prepare_splitting(H.double(), rho)
+            if H.ndim != 2:
+                raise ShapeError(f"{_NAME}: found H {tuple(H.shape)}, expected (N,N), or one of each problem at a call")
+            factors = prepare_splitting(checked_hessian(H, _NAME), rho)
             offset, step = factors.offset, factors.step
         double_step = 2 * step
         double_step.diagonal().add_(2 - RELAXATION)
+        low, high = checked_bounds(lower, upper, H, _NAME)
+        if isinstance(lower, Real) and isinstance(upper, Real):  # by numbers clamps are quicker
+            self.lower, self.upper = float(lower), float(upper)
+        else:
+            self.register_buffer("lower", low)
+            self.register_buffer("upper", high)
         self.register_buffer("offset", offset)
         self.register_buffer("minus_step", -step.float())
         self.register_buffer("double_step", double_step.float())
@@ -79,19 +104,27 @@ class FixedSplitting(nn.Module):
 
         Args:
             f: (B,N), float64.
-            H: of each problem, (B,N,N), float64; the one given before if absent.
+            H: of each problem, (B,N,N), or of all, (N,N), float64; the one given before if absent.
             start: (B,N); zero if absent.
+
+        Raises:
+            ShapeError, ValueRangeError: the inputs do not fit each other or are not finite. A compiled or exported
+                call, and one under a transform, is not checked.
         """
+        f = as_tensor("f", f, "(B,N)")
         f = f.to(torch.promote_types(f.dtype, self.minus_step.dtype))
-        start = (torch.zeros_like(f) if start is None else start.to(f)).clamp(self.lower, self.upper)
-        z = v = start.to(self.minus_step)
+        if H is None and not len(self.offset):
+            raise ShapeError(f"{_NAME}: found no H, expected one here or where the module is made")
+        start = None if start is None else as_tensor("start", start, "(B,N)").to(f)
+        check_call((self.offset if H is None else as_tensor("H", H, "(B,N,N)")).to(f), f, start, _NAME, self.lower)
+        z = v = self._clip((torch.zeros_like(f) if start is None else start).to(self.minus_step))
         if H is not None:
-            return self._with_own(f, H.to(f), z)
+            return self._with_own(f, H.to(f) if H.ndim == 3 else H.to(f).expand(len(f), -1, -1), z)
         constant = (f @ self.offset.to(f)).to(z)
 
         def step(v: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
             v = torch.addmm(torch.addmm(constant, v, self.minus_step), z, self.double_step)
-            return v, v.clamp(self.lower, self.upper)
+            return v, self._clip(v)
 
         return fixed_loop(step, self.steps, (v, z))[1]
 
@@ -115,7 +148,11 @@ class FixedSplitting(nn.Module):
         self, constant: Tensor, minus_step: Tensor, double_step: Tensor, v: Tensor, z: Tensor
     ) -> tuple[Tensor, Tensor]:
         v = constant + v @ minus_step + z @ double_step
-        return v, v.clamp(self.lower, self.upper)
+        return v, self._clip(v)
+
+    def _clip(self, v: Tensor) -> Tensor:
+        lower, upper = (bound.to(v) if isinstance(bound, Tensor) else bound for bound in (self.lower, self.upper))
+        return v.clamp(lower, upper)
 
     def _stretches(self) -> list[int]:
         """The steps between one forming of the constant and the next."""

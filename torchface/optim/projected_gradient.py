@@ -19,9 +19,9 @@ from torch import Tensor, nn
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.number_checks import as_tensor, checked_count, checked_number
-from torchface.optim.box_checks import check_finite, check_vectors, checked_bounds, checked_hessian
+from torchface.optim.box_checks import as_vectors, check_call, checked_bounds, checked_hessian
 from torchface.optim.box_problem import metric
-from torchface.optim.data_dependent import is_transformed
+from torchface.optim.data_dependent import is_recorded, is_transformed
 from torchface.optim.full_precision import full_precision
 from torchface.optim.implicit import free_step
 from torchface.optim.prepared_tensors import Prepared
@@ -46,7 +46,8 @@ class ProjectedGradient(nn.Module):
     Args:
         H: (N,N) or (B,N,N), symmetric and positive semidefinite without a row of zeros; a buffer, or a parameter where
             an ``nn.Parameter`` is given. May be absent where each call has its own.
-        lower: a number or (N,); ``-inf`` for none.
+        lower: a number or (N,); ``-inf`` for none. Bounds are kept in float64, which ``.float()`` rounds for good, and
+            rounded to the dtype of f.
         upper: a number or (N,); ``inf`` for none.
         steps: at most so many. On 53 shapes of a real rig the worst relative gap is 5e-4 after 200 and 2e-8 after 400.
         tolerance: where given, it stops before, when no problem's residual
@@ -94,19 +95,15 @@ class ProjectedGradient(nn.Module):
             self.H = H
         else:
             self.register_buffer("H", H)
-        like = torch.zeros(1) if H is None else H.detach()
         if H is not None:
             checked_hessian(H, _NAME)
             _check_diagonal(H)
         # A parameter's changes with it, in a compiled call too.
-        fixed = H is not None and not isinstance(H, nn.Parameter)
-        self.register_buffer("eigenvalue", largest_eigenvalue(like) if fixed else None)
-        low, high = (torch.as_tensor(bound, dtype=like.dtype, device=like.device) for bound in (lower, upper))
-        ends = torch.broadcast_tensors(low, high) if H is None else checked_bounds(low, high, like, _NAME)
-        if H is None and (ends[0].ndim > 1 or not bool((ends[0] <= ends[1]).all())):
-            raise ValueRangeError(f"ProjectedGradient: found lower {lower} and upper {upper}, expected the lower below")
-        self.register_buffer("lower", ends[0].to(like, copy=True))
-        self.register_buffer("upper", ends[1].to(like, copy=True))
+        kept = None if H is None or isinstance(H, nn.Parameter) else largest_eigenvalue(H.detach())
+        self.register_buffer("eigenvalue", kept)
+        low, high = checked_bounds(lower, upper, H, _NAME)
+        self.register_buffer("lower", low)
+        self.register_buffer("upper", high)
 
     @full_precision
     def forward(self, f: Tensor, H: Tensor | None = None, start: Tensor | None = None) -> Tensor:
@@ -126,16 +123,13 @@ class ProjectedGradient(nn.Module):
         if H is None:
             raise ShapeError("ProjectedGradient: found no H, expected one here or where the module is made")
         H = as_tensor("H", H, "(N,N) or (B,N,N)")
-        f = as_tensor("f", f, "(B,N)", H.dtype)
-        start = None if start is None else as_tensor("start", start, "(B,N)", H.dtype)
-        if not (_recorded() or is_transformed()):
-            check_vectors(H, f, start, _NAME)
-            check_finite(f, start, _NAME)
-            if self.lower.ndim and len(self.lower) != f.shape[1]:
-                raise ShapeError(f"{_NAME}: found f {tuple(f.shape)}, expected {len(self.lower)} columns, as of bounds")
-            if not own:
-                _check_diagonal(H)
+        f = as_vectors("f", f, H)
+        start = None if start is None else as_vectors("start", start, H)
+        check_call(H, f, start, _NAME, self.lower)
+        if not (own or is_recorded() or is_transformed()):
+            _check_diagonal(H)
         asks = is_transformed() or (torch.is_grad_enabled() and (f.requires_grad or H.requires_grad))
+        asks = asks and not torch.onnx.is_in_onnx_export()  # a file has no gradients
         lower, upper = self.lower.to(f), self.upper.to(f)
         if asks and self.through_steps:
             return self._steps(H, f, start, self._eigenvalue(H, own), (lower, upper))
@@ -152,7 +146,7 @@ class ProjectedGradient(nn.Module):
         kept = self.eigenvalue
         if not own or kept is None:
             return largest_eigenvalue(H)
-        if not (_recorded() or is_transformed()):
+        if not (is_recorded() or is_transformed()):
             found = self._followed.get((H,), lambda: largest_eigenvalue(H))
             if found.device != kept.device or not torch.equal(found.to(kept), kept):
                 self.eigenvalue = kept = found.to(kept)
@@ -215,7 +209,7 @@ def _looped(step: Callable[..., _State], state: _State, steps: int, tolerance: f
 
     Compiled and exported graphs hold them as one loop.
     """
-    if _recorded() and not torch.is_grad_enabled():
+    if is_recorded() and not torch.is_grad_enabled():
 
         def going(number: Tensor, *rest: Tensor) -> Tensor:
             return number < steps if tolerance is None else (number < steps) & (rest[-1] > tolerance)
@@ -229,17 +223,12 @@ def _looped(step: Callable[..., _State], state: _State, steps: int, tolerance: f
     return state
 
 
-def _recorded() -> bool:
-    return torch.compiler.is_compiling() or torch.compiler.is_exporting()
-
-
 def _check_diagonal(H: Tensor) -> None:
-    if not bool(torch.isfinite(H).all()):
-        raise ValueRangeError("ProjectedGradient: H holds NaN or infinite entries, expected finite ones")
     empty = (H.diagonal(dim1=-2, dim2=-1) < metric(H)).nonzero()
     if len(empty):
         rows = sorted({int(row) for row in empty[:, -1]})[:5]
         raise ValueRangeError(
-            f"ProjectedGradient: found rows {rows} of H that are zero, expected a positive diagonal: nothing holds "
-            "these variables; add a ridge to H, or leave them out"
+            f"ProjectedGradient: found rows {rows} of H that are zero, or nearly so beside the largest diagonal entry, "
+            f"{float(H.diagonal(dim1=-2, dim2=-1).max()):.3g}; expected a positive diagonal: nothing holds these "
+            "variables; add a ridge to H, or leave them out"
         )
