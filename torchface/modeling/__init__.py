@@ -23,14 +23,9 @@ from torchface.modeling.rigging.deformation_transfer import (
     transfer_with_report,
 )
 from torchface.modeling.rigging.example_rigging import ExampleRig, RiggingSchedule, rig_from_examples
-from torchface.modeling.rigging.expression_regression import (
-    ExpressionRegression,
-    ExpressionSettings,
-    NeutralRig,
-    neutral_rig,
-    rig_from_neutral,
-)
+from torchface.modeling.rigging.expression_regression import ExpressionRegression, ExpressionSettings
 from torchface.modeling.rigging.neutral_check import neutral_notes
+from torchface.modeling.rigging.neutral_rig import NeutralRig, neutral_rig, rig_from_neutral
 from torchface.modeling.rigging.open_eyed_neutral import open_eyes
 from torchface.modeling.rigging.other_topology import shapes_on
 from torchface.modeling.rigging.part_clearance import clear_parts
