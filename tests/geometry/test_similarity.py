@@ -4,7 +4,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from torchface.errors import ShapeError
+from torchface.errors import AlignmentError, ShapeError, ValueRangeError
 from torchface.geometry.similarity import similarity_transform
 
 
@@ -51,3 +51,27 @@ def test_two_points_are_too_few() -> None:
     points[:, :2] = 1.0
     with pytest.raises(ShapeError, match="2 points present, expected at least 3"):
         similarity_transform(points, torch.zeros(1, 5, 3))
+
+
+def test_no_sets_give_no_similarities() -> None:
+    none = torch.zeros(0, 4, 3)
+    assert similarity_transform(none, none).apply(none).shape == (0, 4, 3)
+
+
+def test_points_that_coincide_have_no_scale() -> None:
+    """Without a scale nothing is undetermined but the rotation."""
+    points, *_ = planted(2)
+    same = points.clone()
+    same[1] = 7.3
+    for source, target in ((same, points), (points, same)):
+        with pytest.raises(AlignmentError, match=r"coincide in rows \[1\]"):
+            similarity_transform(source, target)
+        found = similarity_transform(source, target, scale=False)
+        torch.testing.assert_close(found.apply(source).mean(1), target.mean(1))
+
+
+@pytest.mark.parametrize("weight", [-1.0, torch.nan, torch.inf])
+def test_weights_are_finite_and_not_negative(weight: float) -> None:
+    points, *_ = planted(1, 5)
+    with pytest.raises(ValueRangeError, match="weights: found a negative, infinite or NaN one"):
+        similarity_transform(points, points, torch.tensor([[1.0, 1, 1, 1, weight]]))

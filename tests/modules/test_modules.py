@@ -321,6 +321,16 @@ def test_graphs_of_solvers_are_exported(kind: str) -> None:
         assert_same(tree_leaves(program.module()(*inputs)), tree_leaves(graph(*inputs)), 1e-5)
 
 
+@pytest.mark.parametrize(
+    "name", ["BoxQP", "ProjectedGradient", "FixedSplitting", "ExpressionRegression", "ActionUnitClassifier"]
+)
+def test_no_samples_give_no_results(name: str) -> None:
+    example = EXAMPLES[name]
+    first, *rest = example.inputs()
+    (some,), (none,) = (outputs(example, example.make(0), part, *rest) for part in (first, first[:0]))
+    assert none.shape == (0, *some.shape[1:])
+
+
 NETWORKS = ("LandmarkNetwork", "BoxNetwork", "EyeNetwork", "PartNetwork")
 
 

@@ -5,13 +5,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.errors import ShapeError
+from torchface.errors import AlignmentError, ShapeError, ValueRangeError
 from torchface.geometry.rotations import cross_matrix
 
 __all__ = ["Similarity", "similarity_transform"]
 
 MIN_HEAD_SCALE, MAX_HEAD_SCALE = 0.8, 1.25
 """Two heads in the same unit, a child's and a large man's included, do not differ by more in size."""
+_COINCIDENT = 1e-12  # a share of the distance from the origin that rounding leaves of none
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,6 +83,8 @@ def similarity_transform(
 
     Raises:
         ShapeError: the shapes differ, or fewer than three points are present.
+        ValueRangeError: a weight is negative or not finite.
+        AlignmentError: all points of a set coincide, and a scale is asked for.
 
     Source: Horn 1987; thesis 3.2.3 and 4.1.2.
 
@@ -98,8 +101,10 @@ def similarity_transform(
     x, y = source.double(), target.double()
     seen = torch.isfinite(x).all(-1) & torch.isfinite(y).all(-1)
     w = seen.double() if weights is None else weights.double() * seen
-    # A graph cannot ask for numbers.
-    if not torch.compiler.is_compiling() and int((w > 0).sum(-1).min()) < 3:
+    checked = not torch.compiler.is_compiling()  # a graph cannot ask for numbers
+    if checked and not bool(((w >= 0) & (w < torch.inf)).all()):
+        raise ValueRangeError("weights: found a negative, infinite or NaN one, expected finite ones of at least 0")
+    if checked and len(x) and int((w > 0).sum(-1).min()) < 3:
         raise ShapeError(
             f"similarity_transform: found {int((w > 0).sum(-1).min())} points present, expected at least 3"
         )
@@ -107,6 +112,13 @@ def similarity_transform(
     w = (w / w.sum(-1, keepdim=True))[..., None]
     mean_x, mean_y = (w * x).sum(-2, keepdim=True), (w * y).sum(-2, keepdim=True)
     x, y = x - mean_x, y - mean_y
+    for points, mean in ((x, mean_x), (y, mean_y)) if checked and scale else ():
+        together = (w * points.square()).sum((-1, -2)) <= _COINCIDENT**2 * mean.square().sum((-1, -2))
+        if bool(together.any()):
+            raise AlignmentError(
+                f"similarity_transform: found points that coincide in rows {together.nonzero()[:5, 0].tolist()}, "
+                "expected some apart: they have no scale"
+            )
     covariance = (w * y).transpose(-1, -2) @ x
     u, singular, vh = torch.linalg.svd(covariance)
     # Without the guard a mirrored or flat point set would come back as a reflection.

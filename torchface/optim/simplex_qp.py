@@ -5,6 +5,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.number_checks import as_tensor, checked_number
+from torchface.optim.box_checks import as_vectors
 from torchface.optim.implicit import SimplexSolution
 from torchface.optim.simplex_active_set import Mixture, SimplexProblems, solve_simplex
 
@@ -74,8 +75,10 @@ class SimplexQP:
     def __call__(self, f: Tensor, start: Tensor | None = None, tolerance: float | None = None) -> Tensor:
         """The minimisers for f; arguments and errors are those of ``simplex_qp``."""
         H = self._H
-        f = as_tensor("f", f, "(B,N)", H.dtype)
+        f = as_vectors("f", f, H)
         _check_vectors(H, f, start)
+        if not f.numel():
+            return f.clone()
         limit = _TOLERANCE[H.dtype]
         if tolerance is not None:
             limit = checked_number("simplex_qp: tolerance", tolerance, 0.0, 0.5)
@@ -89,8 +92,6 @@ class SimplexQP:
         return torch.stack([_differentiable(*group) for group in zip(H, f, found, strict=True)])
 
     def _solved(self, f: Tensor, start: Tensor | None, tolerance: float) -> Tensor:
-        if f.numel() == 0:
-            return f.clone()
         variables = f.shape[-1]
         matrices = self._exact.view(-1, variables, variables)
         flat = f.reshape(-1, variables)
@@ -113,11 +114,13 @@ def _differentiable(H: Tensor, f: Tensor, solution: Tensor) -> Tensor:
 
 
 def _check_matrices(H: Tensor) -> None:
-    if H.ndim not in (2, 3) or H.shape[-1] != H.shape[-2] or H.shape[-1] == 0 or len(H) == 0:
+    if H.ndim not in (2, 3) or H.shape[-1] != H.shape[-2] or H.shape[-1] == 0:
         raise ShapeError(f"simplex_qp: found H {tuple(H.shape)}, expected (N,N), (B,N,N) or (G,N,N)")
     if H.dtype not in _TOLERANCE:
         raise ValueRangeError(f"simplex_qp: found H of {H.dtype}, expected float32 or float64")
     known = H.detach()
+    if not len(known):
+        return
     if not bool(torch.isfinite(known).all()):
         raise ValueRangeError("simplex_qp: H holds NaN or infinite entries, expected finite ones")
     largest = float(known.abs().max())

@@ -227,6 +227,8 @@ def test_bad_input(prior: DynamicsPrior, monkeypatch: pytest.MonkeyPatch) -> Non
         DynamicsPrior.fit([], NAMES)
     with pytest.raises(ShapeError, match=r"takes of \(9, 2\)"):
         DynamicsPrior.fit([torch.zeros(9, 2)], NAMES)
+    with pytest.raises(ShapeError, match=r"takes of \(5,\), expected \(T,5\) each"):
+        DynamicsPrior.fit(torch.zeros(30, 5), NAMES)
     with pytest.raises(ShapeError, match="at least 9 frames for a window of 8"):
         DynamicsPrior.fit([torch.zeros(8, 5), torch.zeros(30, 5)], NAMES, 8)
     with pytest.raises(ShapeError, match="one take of 9 frames, expected at least 12 for a window of 4"):

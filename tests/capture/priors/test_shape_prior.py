@@ -1,5 +1,7 @@
 """Densities against scikit-learn and scipy, their quadratics against finite differences."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,7 @@ from scipy.stats import multivariate_t
 from sklearn.cluster import estimate_bandwidth
 from torch import Tensor
 
-from torchface.capture import ShapePrior
+from torchface.capture import DynamicsPrior, ShapePrior
 from torchface.capture.priors import ParzenDensity, ReciprocalPrior, StudentDensity, automatic_bandwidth, face_halves
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 
@@ -64,6 +66,23 @@ def test_bounds_touch_and_lie_above(density: ParzenDensity | StudentDensity) -> 
 
     rise = value(other) - value(at.detach())
     assert bool((rise >= (density.log_density(at) - density.log_density(other)).detach() - 1e-9).all())
+
+
+def test_energies_have_the_value_that_they_touch() -> None:
+    takes, groups, here, there = [clusters(200)], face_halves(NAMES), clusters(5, seed=3), clusters(5, seed=4)
+    prior = ShapePrior.fit(takes, NAMES, groups).double()
+    torch.testing.assert_close(prior.energy(here).value(here), -prior.strength * prior.log_density(here))
+    assert (prior.energy(here).value(there) > -prior.strength * prior.log_density(there)).all()
+    paper = ReciprocalPrior.fit(takes, NAMES, groups).double()
+    parts = torch.stack([density.log_density(part).exp() for density, part in paper.parts(here)])
+    wanted = paper.strength * (1 / (parts + paper.guard)).sum(0)
+    torch.testing.assert_close(paper.energy(here).value(here), wanted)
+
+
+@pytest.mark.parametrize("kind", [ShapePrior, ReciprocalPrior, DynamicsPrior])
+def test_names_stand_once(kind: Any) -> None:
+    with pytest.raises(NameMismatchError, match="more than once: jawOpen"):
+        kind.fit([clusters(60)], (*NAMES[:3], "jawOpen", "mouthClose"))
 
 
 def test_halves_are_independent() -> None:

@@ -14,6 +14,7 @@ from torchface.capture.action_units.region_video import RegionVideo
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.io.action_labels import ActionLabels
+from torchface.optim.data_dependent import is_recorded, is_transformed
 from torchface.progress import Progress
 
 _MAX_COUNT = 4096
@@ -50,8 +51,7 @@ class GroupClassifier(nn.Module):
 
     def magnitudes(self, images: Tensor) -> Tensor:
         """Of the Gabor filters, (B,D), of the group's regions (B,G,h,w), merged."""
-        batch, regions = images.shape[:2]
-        return self.gabor(images.flatten(0, 1)).reshape(batch, regions, -1).flatten(1)
+        return self.gabor(images.flatten(0, 1)).reshape(len(images), len(self.mean))
 
     def scores(self, images: Tensor, rest: Tensor) -> Tensor:
         """Of every class, (B,C), for regions (B,G,h,w) and the regions at rest (G,h,w)."""
@@ -90,7 +90,10 @@ class TrainingSettings:
 
     def __post_init__(self) -> None:
         if self.levels < 2 or not 0 < self.variance <= 1 or not self.penalty > 0 or self.warps < 0:
-            raise ValueRangeError(f"training settings: found {self}, expected levels >= 2 and a variance in (0,1]")
+            raise ValueRangeError(
+                f"training settings: found {self}, expected levels >= 2, a variance in (0,1], a positive penalty and "
+                "warps >= 0"
+            )
 
 
 DEFAULT_TRAINING = TrainingSettings()
@@ -221,6 +224,7 @@ class ActionUnitClassifier(nn.Module):
 
         Raises:
             ShapeError: another shape.
+            ValueRangeError: NaN or infinity in a pattern.
         """
         parts = self.group_classifiers()
         own, still = self.split(regions), self.split(rest[None])
@@ -232,6 +236,8 @@ class ActionUnitClassifier(nn.Module):
             raise ShapeError(
                 f"regions: found {tuple(regions.shape)}, expected (B,{len(self.regions)},{self.size},{self.size})"
             )
+        if not (is_recorded() or is_transformed() or bool(torch.isfinite(regions).all())):
+            raise ValueRangeError("regions: found NaN or infinity, expected pictures in [0,1]")
         return [regions[:, [self.regions.index(name) for name in group.regions]] for group in self.groups]
 
 

@@ -187,6 +187,7 @@ class DynamicsPrior(nn.Module):
 
         Raises:
             ShapeError: no takes, of another number of shapes, or too short for the window.
+            NameMismatchError: a name stands twice.
             ValueRangeError: no window without a NaN, or a setting out of range.
 
         Source: thesis 4.2.10 and the appendix "Learning the prior".

@@ -19,10 +19,10 @@ from torchface.capture.priors.gaussian_process import (
 )
 from torchface.capture.priors.motion_features import face_regions, motion_basis, moving_parts
 from torchface.capture.priors.motion_noise import MotionNoise
+from torchface.capture.priors.name_translation import checked_names
 from torchface.capture.priors.take_frames import MOST_FRAMES, drawn_rows
 from torchface.capture.priors.take_windows import FOLDS, Autoregression, Part, RunningMoments, TakeWindows
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.number_checks import checked_type
 from torchface.progress import Progress, silent
 
 _LEARNING_RATE = 0.1
@@ -168,7 +168,7 @@ def fit_dynamics_prior(
     progress: Progress | None = None,
 ) -> DynamicsPrior:
     """See ``DynamicsPrior.fit``."""
-    names = tuple(checked_type("names: a name", name, str) for name in names)
+    names = checked_names(names)
     settings = settings or DynamicsSettings()
     regions = tuple(tuple(group) for group in (face_regions(names) if groups is None else groups))
     progress = progress or silent
@@ -310,7 +310,7 @@ def _noise(
 
 def _check(takes: Sequence[Tensor], names: tuple[str, ...], window: int, fps: float, input_noise: float) -> None:
     wrong = [tuple(take.shape) for take in takes if take.ndim != 2 or take.shape[1] != len(names)]
-    if not takes or wrong:
+    if not len(takes) or wrong:
         found = f"takes of {wrong[0]}" if wrong else "no takes"
         raise ShapeError(f"dynamics prior: found {found}, expected (T,{len(names)}) each")
     if window < 1 or not 0 < fps < math.inf or not 0 <= input_noise < math.inf:

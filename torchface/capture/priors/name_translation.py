@@ -5,9 +5,19 @@ from collections.abc import Sequence
 from torch import Tensor
 
 from torchface.errors import NameMismatchError
+from torchface.number_checks import checked_type
 from torchface.shape_names import mapping
 
 _MIN_LEARNED = 0.5
+
+
+def checked_names(names: Sequence[str]) -> tuple[str, ...]:
+    """Names of shapes to learn, as a tuple, each once."""
+    names = tuple(checked_type("names: a name", name, str) for name in names)
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise NameMismatchError(f"names: found more than once: {', '.join(twice[:5])}; expected each once")
+    return names
 
 
 def name_matrices(learned: Sequence[str], names: Sequence[str]) -> tuple[Tensor, Tensor]:

@@ -5,18 +5,19 @@ from __future__ import annotations
 import copy
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Protocol, cast
 
 import torch
 from torch import Tensor, nn
 
 from torchface.capture.energy import Quadratic
-from torchface.capture.priors.name_translation import name_matrices, require_same_names
+from torchface.capture.priors.name_translation import checked_names, name_matrices, require_same_names
 from torchface.capture.priors.parzen_window import ParzenDensity
 from torchface.capture.priors.student_t import PARTING_VARIANCE, StudentDensity, StudentGroups
 from torchface.capture.priors.take_frames import TakeFrames
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_number, checked_type
+from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_number
 from torchface.optim.full_precision import full_precision
 
 _UPPER = re.compile(r"(eye|brow|pupil)", re.IGNORECASE)
@@ -117,9 +118,10 @@ class ShapePrior(nn.Module):
 
         Raises:
             ShapeError: no takes, or of another number of shapes.
+            NameMismatchError: a name stands twice.
             ValueRangeError: fewer than two frames with all weights.
         """
-        names = tuple(checked_type("names: a name", name, str) for name in names)
+        names = checked_names(names)
         TakeFrames(takes, len(names)).count()
         groups = (tuple(range(len(names))),) if groups is None else groups
         seen = [TakeFrames(takes, len(names), tuple(group)) for group in groups]
@@ -134,10 +136,15 @@ class ShapePrior(nn.Module):
     def energy(self, weights: Tensor) -> Quadratic:
         """The quadratic that touches the energy at weights (B,N) from above."""
         weights = self._checked(weights)
-        return self._assembled(weights, weights.new_full((len(self.groups), len(weights)), self.strength))
+        factors = weights.new_full((len(self.groups), len(weights)), self.strength)
+        return self._assembled(weights, factors, -self.strength * self.log_density(weights))
 
-    def _assembled(self, weights: Tensor, factors: Tensor) -> Quadratic:
-        """The groups' bounds at weights (B,N), each times its factor (G,B)."""
+    def _assembled(self, weights: Tensor, factors: Tensor, values: Tensor) -> Quadratic:
+        """The groups' bounds at weights (B,N), each times its factor (G,B), with the values (B,) there."""
+        made = self._bounds(weights, factors)
+        return replace(made, constant=values - made.value(weights))
+
+    def _bounds(self, weights: Tensor, factors: Tensor) -> Quadratic:
         if self.groups == (tuple(range(len(self.names))),):
             (density,) = cast("Sequence[Density]", self.densities)
             own, pull = density.bound(weights)
@@ -304,6 +311,7 @@ class ReciprocalPrior(ShapePrior):
 
         Source: thesis 4.2.8.
         """
+        names = checked_names(names)
         together = TakeFrames(takes, len(names)).some(seed=seed)
         groups = face_halves(names) if groups is None else groups
         return cls(names, groups, [ParzenDensity.fit(together[:, list(group)], seed=seed) for group in groups])
@@ -313,8 +321,11 @@ class ReciprocalPrior(ShapePrior):
         """The quadratic with the energy's value and slope at weights (B,N)."""
         weights = self._checked(weights)
         density = torch.stack([density.log_density(part) for density, part in self.parts(weights)]).exp()
+        reciprocal = 1 / (density + self.guard)
         # d/dL of 1/(exp(-L) + p0) for L = -log p.
-        return self._assembled(weights, self.strength * density / (density + self.guard).square())
+        return self._assembled(
+            weights, self.strength * density * reciprocal.square(), self.strength * reciprocal.sum(0)
+        )
 
     @property
     def config(self) -> dict[str, Any]:

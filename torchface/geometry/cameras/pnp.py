@@ -85,9 +85,10 @@ def _checked(
     if not torch.isfinite(w).all() or (w < 0).any():
         raise ValueRangeError("solve_pnp: found a negative or infinite weight, expected finite ones of at least 0")
     w = w * seen
-    if int((w > 0).sum(1).min()) < _MIN_POINTS:
+    counts = (w > 0).sum(1)
+    if bool((counts < _MIN_POINTS).any()):
         raise ValueRangeError(
-            f"solve_pnp: found {int((w > 0).sum(1).min())} points seen in view {int((w > 0).sum(1).argmin())}, "
+            f"solve_pnp: found {int(counts.min())} points seen in view {int(counts.argmin())}, "
             f"expected at least {_MIN_POINTS}"
         )
     x = points.detach().double().expand(len(q), -1, -1)
