@@ -1,11 +1,12 @@
 """Take and Track: frames agree, channels go by name."""
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 import torch
 
-from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
+from torchface.errors import ArgumentTypeError, NameMismatchError, ShapeError, TorchfaceError, ValueRangeError
 from torchface.take import Take, Track, empty_frames
 
 
@@ -134,3 +135,31 @@ def test_the_frame_nearest_to_each_moment_is_shown() -> None:
     off = (take.times[:, None] - torch.arange(5) / 10).abs()
     torch.testing.assert_close(off[take.even_rows(), torch.arange(5)], off.amin(0))
     assert Take(10.0, weights=uneven().weights).even_rows().tolist() == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize(
+    "rows", [[0, 2], torch.tensor([-3, -1]), torch.tensor([True, False, True]), [True, False, True]]
+)
+def test_frames_are_taken_by_numbers_or_by_a_mask(rows: Any) -> None:
+    take = Take(2.0, weights=Track(("a",), torch.arange(3.0)[:, None, None]), timecode=("x", "y", "z"))
+    some = take.rows(rows)
+    assert some.weights is not None
+    assert some.weights.values.flatten().tolist() == [0.0, 2.0]
+    assert (some.timecode, some.times.tolist()) == (("x", "z"), [0.0, 1.0])
+
+
+@pytest.mark.parametrize(
+    ("rows", "error", "says"),
+    [
+        (torch.tensor([0, 99]), ValueRangeError, "found frame 99, expected some of 3"),
+        (torch.tensor([True, False]), ShapeError, r"found \(2,\), expected \(K,\), or a mask \(3,\)"),
+        (torch.tensor([0.0, 1.0]), ArgumentTypeError, "found floats"),
+        ("all", ArgumentTypeError, "the text 'all'"),
+    ],
+)
+def test_frames_that_are_not_there_are_named(rows: Any, error: type[TorchfaceError], says: str) -> None:
+    take = Take(2.0, weights=Track(("a",), torch.arange(3.0)[:, None, None]))
+    with pytest.raises(error, match=says):
+        take.rows(rows)
+    with pytest.raises(ArgumentTypeError, match=r"frames: found .*, expected a slice"):
+        take.frames(rows)

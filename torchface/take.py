@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ArgumentTypeError, NameMismatchError, ShapeError, ValueRangeError
-from torchface.number_checks import as_real, check_rate, checked_type
+from torchface.number_checks import as_real, as_tensor, check_rate, checked_type
 from torchface.temporal.frame_grid import check_gaps, frame_grid
 from torchface.temporal.interpolation import frames_beside, values_at
 
@@ -188,6 +188,7 @@ class Take:
 
     def frames(self, rows: slice) -> Take:
         """Consecutive frames, with their extras and frame numbers."""
+        checked_type("frames", rows, slice)
         first, last, step = rows.indices(len(self))
         if step != 1:
             raise ValueRangeError(f"take: found a step of {step} frames, expected consecutive ones")
@@ -200,17 +201,22 @@ class Take:
         seconds = None if self.seconds is None else self.seconds[rows]
         return Take(self.fps, markers, landmarks, weights, timecode, extras, seconds)
 
-    def rows(self, rows: Tensor) -> Take:
+    def rows(self, rows: Tensor | Sequence[int]) -> Take:
         """Some frames at their own times, with their extras and frame numbers.
 
         Args:
-            rows: which, rising, (K,) int64.
+            rows: which, rising, (K,) int64, or (T,) bool; negative ones count from the end.
+
+        Raises:
+            ArgumentTypeError, ShapeError: no whole numbers (K,) and no mask (T,).
+            ValueRangeError: there is no such frame, or they do not rise.
 
         Example:
             >>> take = Take(2.0, weights=Track(("jawOpen",), torch.tensor([0.0, 0.5, 1.0])[:, None, None]))
             >>> take.rows(torch.tensor([0, 2])).times.tolist()
             [0.0, 1.0]
         """
+        rows = _frame_numbers(as_tensor("rows", rows, "(K,) of whole numbers"), len(self))
         markers, landmarks, weights = (
             None if track is None else track.frames(rows) for track in (self.markers, self.landmarks, self.weights)
         )
@@ -289,6 +295,20 @@ class Take:
             return Track(track.names, values(track.values), sure)
 
         return Take(fps, moved(self.markers), moved(self.landmarks), moved(self.weights))
+
+
+def _frame_numbers(rows: Tensor, count: int) -> Tensor:
+    """Frames (K,) int64, of numbers or of a mask."""
+    if rows.dtype == torch.bool and rows.shape == (count,):
+        return rows.nonzero()[:, 0]
+    if rows.is_floating_point():
+        raise ArgumentTypeError("rows: found floats, expected whole numbers (K,)")
+    if rows.ndim != 1 or rows.dtype == torch.bool:
+        raise ShapeError(f"rows: found {tuple(rows.shape)}, expected (K,), or a mask ({count},)")
+    outside = rows[(rows < -count) | (rows >= count)]
+    if len(outside):
+        raise ValueRangeError(f"rows: found frame {int(outside[0])}, expected some of {count} frames")
+    return torch.where(rows < 0, rows + count, rows).long()
 
 
 def _cut_extras(extras: dict[str, Any], rows: slice | Tensor, count: int) -> dict[str, Any]:

@@ -1,5 +1,6 @@
 """Morphable models against scikit-learn, planted coefficients, and their own definition."""
 
+import copy
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -92,6 +93,20 @@ def test_missing_vertices_are_those_not_named(model: MorphableModel) -> None:
     assert torch.allclose(found[:2], model.project(faces[:2, ids], ids, noise=0.5), atol=1e-5)
     assert torch.allclose(found[2:], model.project(faces[2:], noise=0.5), atol=1e-5)
     assert model.project(torch.full_like(faces[:1], float("nan")), noise=1.0).abs().max() == 0
+
+
+@pytest.mark.parametrize("noise", [None, 0.5])
+def test_a_model_in_double_precision_projects_in_it(model: MorphableModel, noise: float | None) -> None:
+    double = copy.deepcopy(model).double()
+    wanted = double.sample(3, torch.Generator().manual_seed(1))
+    found = double.project(double(wanted), noise=noise)
+    assert found.dtype == torch.float64
+    if noise is None:
+        torch.testing.assert_close(found, wanted, rtol=0, atol=1e-5)
+    faces = double(wanted)
+    faces[1, 7, 0] = torch.inf
+    with pytest.raises(ValueRangeError, match=r"infinity in rows \[1\]"):
+        double.project(faces, noise=noise)
 
 
 def test_noise_gives_the_mean_of_the_posterior(model: MorphableModel) -> None:

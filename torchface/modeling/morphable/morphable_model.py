@@ -180,15 +180,15 @@ class MorphableModel(nn.Module):
             noise: standard deviation in the unit of the samples, a number or one a vertex (N,).
 
         Returns:
-            Coefficients (B,K).
+            Coefficients (B,K), in the model's precision.
 
         Raises:
             ShapeError: the shapes differ from the above.
-            ValueRangeError: noise that is not positive, or vertex ids outside the model.
+            ValueRangeError: infinity, noise that is not positive, or vertex ids outside the model.
 
         Source: thesis 3.2.4; Albrecht, Luethi, Vetter 2008 (posterior shape models).
         """
-        samples = samples.to(self.mean)
+        samples = as_tensor("samples", samples, "(B,V,C)").to(self.mean)
         mean, components = self.mean, self.components
         if vertices is not None:
             if vertices.ndim != 1 or (
@@ -200,10 +200,15 @@ class MorphableModel(nn.Module):
             raise ShapeError(f"samples: found {tuple(samples.shape)}, expected (B,{mean.shape[0]},{mean.shape[1]})")
         precision = _precision(noise, len(mean)).to(mean.device)
         residual = (samples - mean).double()
-        seen = torch.isfinite(residual).all(-1)
+        seen = ~residual.isnan().any(-1)
+        infinite = residual.isinf().flatten(1).any(1).nonzero()[:, 0].tolist()
+        if infinite:
+            raise ValueRangeError(
+                f"samples: found infinity in rows {infinite[:5]}, expected numbers, or NaN for missing"
+            )
         deviations = self.standard_deviations.double()
         if vertices is None and noise is None and bool(seen.all()):
-            return (residual.flatten(1).float() @ components.flatten(1).T) / self.standard_deviations
+            return (residual.flatten(1).to(mean) @ components.flatten(1).T) / self.standard_deviations
         residual = torch.where(seen[..., None], residual, 0.0) * precision[:, None]
         modes = components.double() * (deviations[:, None, None] * precision[:, None])
         # Samples that miss the same vertices share one system.
@@ -214,7 +219,7 @@ class MorphableModel(nn.Module):
             basis = modes[:, group].flatten(1)
             observed = residual[rows][:, group].flatten(1)
             result[rows] = _posterior(basis, observed) if noise is not None else _least_squares(basis, observed)
-        return result.float()
+        return result.to(mean)
 
     def log_prob(self, coefficients: Tensor) -> Tensor:
         r""":math:`-\frac12 \lVert a \rVert^2` of coefficients (B,K), (B,); the constant
