@@ -80,9 +80,8 @@ def marker_term(basis: Tensor, rest: Tensor, targets: Tensor) -> Quadratic:
             f"{tuple(targets.shape)}, expected (M,3,N), (M,3), (B,M,3)"
         )
     traced = torch.compiler.is_compiling()  # a graph has one path, of frames that each have an H
-    if not traced and torch.isinf(targets).any():
-        frames = torch.isinf(targets).flatten(1).any(1).nonzero()[:, 0].tolist()
-        raise ValueRangeError(f"markers: infinite in frames {frames[:5]}; expected millimetres, or NaN for not seen")
+    if not traced:
+        check_markers(targets)
     seen = ~torch.isnan(targets).any(-1)
     offset = torch.where(seen[..., None], rest - targets, 0.0)
     rows = basis.flatten(0, 1)
@@ -99,6 +98,13 @@ def marker_term(basis: Tensor, rest: Tensor, targets: Tensor) -> Quadratic:
         H = 2.0 * torch.stack([(rows * one.repeat_interleave(3)[:, None]).T @ rows for one in share])
     weighted = share[..., None] * offset
     return Quadratic(H, 2.0 * (weighted.flatten(1) @ rows), (weighted * offset).sum((-1, -2)))
+
+
+def check_markers(markers: Tensor) -> None:
+    """Raises a ``ValueRangeError`` where a coordinate of markers (B,M,3) is infinite."""
+    frames = torch.isinf(markers).flatten(1).any(1).nonzero()[:, 0].tolist()
+    if frames:
+        raise ValueRangeError(f"markers: infinite in frames {frames[:5]}; expected millimetres, or NaN for not seen")
 
 
 def sparsity_term(shapes: int, weight: float | Tensor, like: Tensor) -> Quadratic:

@@ -121,8 +121,10 @@ def save_take(take: Take, path: str | Path) -> None:
 
     ``.c3d`` and ``.trc`` hold the markers, a ``.csv`` the weights of a take that has some, else its markers or its
     landmarks; whatever else the take holds is left out. Weights whose names are ARKit's 52, in whatever order and case,
-    become a Live Link Face file; others a plain table that keeps their names
-    (:func:`torchface.io.weights.live_link_csv.save_live_link` maps them to ARKit's instead).
+    become a Live Link Face file, from which they come back in its order and spelling (``EyeBlinkLeft``;
+    ``torchface.shape_names.mapping`` leads back); others a plain table that keeps their names
+    (:func:`torchface.io.weights.live_link_csv.save_live_link` maps them to ARKit's instead). A ``.csv`` of one frame
+    holds no rate, and comes back at 60 a second.
 
     Args:
         take: markers in millimetres, landmarks in pixels, or weights.
@@ -132,7 +134,7 @@ def save_take(take: Take, path: str | Path) -> None:
         FileFormatError: the ending is none of ``.c3d``, ``.trc``, ``.csv``.
         ValueRangeError: the take holds nothing for this format, markers and landmarks for one ``.csv``, or infinite
             numbers.
-        NameMismatchError: a name would not come back as it is.
+        NameMismatchError: a name of a plain table would not come back as it is.
 
     Example:
         >>> from torchface.take import Track

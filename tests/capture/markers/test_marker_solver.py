@@ -115,6 +115,9 @@ def test_bad_takes_say_what_is_wrong(setting: tuple[MarkerSolver, Tensor, Tensor
         solver(markers)
     with pytest.raises(ShapeError, match=r"expected \(B,40,3\)"):
         solver(markers[:, :39])
+    markers[7, 2, 1] = torch.inf
+    with pytest.raises(ValueRangeError, match=r"markers: infinite in frames \[7\]"):
+        solver(markers)
 
 
 def test_antagonists_are_one_quantity_whose_sign_may_change(

@@ -11,7 +11,15 @@ from torch import Tensor, nn
 from torchface.attachment import Attachment
 from torchface.capture.antagonist_shapes import one_side, signed_quantities, weaker_sides
 from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
-from torchface.capture.energy import Quadratic, check_weight, chunks_of_frames, marker_term, ridge_term, sparsity_term
+from torchface.capture.energy import (
+    Quadratic,
+    check_markers,
+    check_weight,
+    chunks_of_frames,
+    marker_term,
+    ridge_term,
+    sparsity_term,
+)
 from torchface.correctives.activation import CorrectiveActivation
 from torchface.correctives.corrective_shapes import Corrective, definitions_from_records
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
@@ -269,6 +277,7 @@ class MarkerSolver(nn.Module):
         markers = as_tensor("markers", markers, f"(B,{len(self.rest)},3)")
         if markers.ndim != 3 or markers.shape[1:] != self.rest.shape:
             raise ShapeError(f"markers: found {tuple(markers.shape)}, expected (B,{len(self.rest)},3)")
+        check_markers(markers)
         missing = torch.isnan(markers).any(-1)
         _check_seen(missing)
         tolerance = default_tolerance(markers.dtype)
