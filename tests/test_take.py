@@ -151,9 +151,9 @@ def test_frames_are_taken_by_numbers_or_by_a_mask(rows: Any) -> None:
 @pytest.mark.parametrize(
     ("rows", "error", "says"),
     [
-        (torch.tensor([0, 99]), ValueRangeError, "found frame 99, expected some of 3"),
-        (torch.tensor([True, False]), ShapeError, r"found \(2,\), expected \(K,\), or a mask \(3,\)"),
-        (torch.tensor([0.0, 1.0]), ArgumentTypeError, "found floats"),
+        (torch.tensor([0, 99]), ValueRangeError, r"found \[0, 99\], expected some of 3 frames"),
+        (torch.tensor([True, False]), ValueRangeError, r"found torch.bool \(2,\), .* a mask \(3,\)"),
+        (torch.tensor([0.0, 1.0]), ValueRangeError, "found torch.float32"),
         ("all", ArgumentTypeError, "the text 'all'"),
     ],
 )

@@ -208,8 +208,7 @@ class Take:
             rows: which, rising, (K,) int64, or (T,) bool; negative ones count from the end.
 
         Raises:
-            ArgumentTypeError, ShapeError: no whole numbers (K,) and no mask (T,).
-            ValueRangeError: there is no such frame, or they do not rise.
+            ValueRangeError: no whole numbers (K,) and no mask (T,), no such frame, or they do not rise.
 
         Example:
             >>> take = Take(2.0, weights=Track(("jawOpen",), torch.tensor([0.0, 0.5, 1.0])[:, None, None]))
@@ -301,13 +300,10 @@ def _frame_numbers(rows: Tensor, count: int) -> Tensor:
     """Frames (K,) int64, of numbers or of a mask."""
     if rows.dtype == torch.bool and rows.shape == (count,):
         return rows.nonzero()[:, 0]
-    if rows.is_floating_point():
-        raise ArgumentTypeError("rows: found floats, expected whole numbers (K,)")
-    if rows.ndim != 1 or rows.dtype == torch.bool:
-        raise ShapeError(f"rows: found {tuple(rows.shape)}, expected (K,), or a mask ({count},)")
-    outside = rows[(rows < -count) | (rows >= count)]
-    if len(outside):
-        raise ValueRangeError(f"rows: found frame {int(outside[0])}, expected some of {count} frames")
+    whole = rows.ndim == 1 and not rows.is_floating_point() and rows.dtype != torch.bool
+    if not whole or not bool(((rows >= -count) & (rows < count)).all()):
+        found = rows.tolist() if whole else f"{rows.dtype} {tuple(rows.shape)}"
+        raise ValueRangeError(f"rows: found {found!s:.60}, expected some of {count} frames, (K,), or a mask ({count},)")
     return torch.where(rows < 0, rows + count, rows).long()
 
 

@@ -115,10 +115,8 @@ def similarity_transform(
     for points, mean in ((x, mean_x), (y, mean_y)) if checked and scale else ():
         together = (w * points.square()).sum((-1, -2)) <= _COINCIDENT**2 * mean.square().sum((-1, -2))
         if bool(together.any()):
-            raise AlignmentError(
-                f"similarity_transform: found points that coincide in rows {together.nonzero()[:5, 0].tolist()}, "
-                "expected some apart: they have no scale"
-            )
+            rows = together.nonzero()[:5, 0].tolist()
+            raise AlignmentError(f"similarity_transform: points coincide in rows {rows}, expected some apart")
     covariance = (w * y).transpose(-1, -2) @ x
     u, singular, vh = torch.linalg.svd(covariance)
     # Without the guard a mirrored or flat point set would come back as a reflection.

@@ -128,8 +128,8 @@ class ProjectedGradient(nn.Module):
         check_call(H, f, start, _NAME, self.lower)
         if not (own or is_recorded() or is_transformed()):
             _check_diagonal(H)
-        asks = is_transformed() or (torch.is_grad_enabled() and (f.requires_grad or H.requires_grad))
-        asks = asks and not torch.onnx.is_in_onnx_export()  # a file has no gradients
+        learns = torch.is_grad_enabled() and not torch.onnx.is_in_onnx_export()  # a file has no gradients
+        asks = is_transformed() or (learns and (f.requires_grad or H.requires_grad))
         lower, upper = self.lower.to(f), self.upper.to(f)
         if asks and self.through_steps:
             return self._steps(H, f, start, self._eigenvalue(H, own), (lower, upper))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any, Protocol, cast
 
 import torch
@@ -141,22 +140,19 @@ class ShapePrior(nn.Module):
 
     def _assembled(self, weights: Tensor, factors: Tensor, values: Tensor) -> Quadratic:
         """The groups' bounds at weights (B,N), each times its factor (G,B), with the values (B,) there."""
-        made = self._bounds(weights, factors)
-        return replace(made, constant=values - made.value(weights))
-
-    def _bounds(self, weights: Tensor, factors: Tensor) -> Quadratic:
         if self.groups == (tuple(range(len(self.names))),):
             (density,) = cast("Sequence[Density]", self.densities)
             own, pull = density.bound(weights)
-            return Quadratic(factors[0, :, None, None] * own, factors[0, :, None] * pull)
-        H = weights.new_zeros(len(weights), len(self.names), len(self.names))
-        f = weights.new_zeros(len(weights), len(self.names))
-        for (density, part), group, factor in zip(self.parts(weights), self.groups, factors, strict=True):
-            own, pull = density.bound(part)
-            rows = torch.tensor(group, device=weights.device)
-            H[:, rows[:, None], rows] = factor[:, None, None] * own
-            f[:, rows] = factor[:, None] * pull
-        return Quadratic(H, f)
+            H, f = factors[0, :, None, None] * own, factors[0, :, None] * pull
+        else:
+            H = weights.new_zeros(len(weights), len(self.names), len(self.names))
+            f = weights.new_zeros(len(weights), len(self.names))
+            for (density, part), group, factor in zip(self.parts(weights), self.groups, factors, strict=True):
+                own, pull = density.bound(part)
+                rows = torch.tensor(group, device=weights.device)
+                H[:, rows[:, None], rows] = factor[:, None, None] * own
+                f[:, rows] = factor[:, None] * pull
+        return Quadratic(H, f, values - Quadratic(H, f).value(weights))
 
     def parts(self, weights: Tensor) -> list[tuple[Density, Tensor]]:
         """Each group's density, with its columns of weights (B,N)."""

@@ -263,9 +263,9 @@ def _no_seams(count: int) -> Seams:
 
 
 def _similarity(source: Tensor, target: Tensor) -> Similarity:
-    similarity = similarity_transform(source[None], target[None])
     size = float((target - target.mean(0)).square().sum(-1).mean().sqrt())
-    if not size > 0 or not float(similarity.scale[0]) > 1e-6:
+    similarity = similarity_transform(source[None], target[None]) if size > 0 else None
+    if similarity is None or not float(similarity.scale[0]) > 1e-6:
         raise ValueRangeError(f"transfer_deformation: the target measures {size:.3g} mm across; expected a face")
     return similarity
 

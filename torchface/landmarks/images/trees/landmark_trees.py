@@ -150,7 +150,6 @@ class LandmarkTrees(nn.Module):
         if not float((self.mean - self.mean.mean(0)).abs().max()) > 0:
             raise ValueRangeError("mean: found a single point, expected a shape")
 
-    @full_precision
     def forward(self, images: Tensor, boxes: Tensor) -> Tensor:
         """Landmarks (B,L,2), pixels.
 
@@ -167,7 +166,6 @@ class LandmarkTrees(nn.Module):
             raise ShapeError(f"boxes: found {tuple(boxes.shape)}, expected ({len(images)},4)")
         return self.refine(images, initial_shapes(self.mean, boxes.to(self.mean)))
 
-    @full_precision
     def refine(self, images: Tensor, shapes: Tensor) -> Tensor:
         """Landmarks (B,L,2) from other starts than the mean shape in a box, such as where they were a frame ago.
 
@@ -182,6 +180,7 @@ class LandmarkTrees(nn.Module):
             raise ShapeError(f"shapes: found {tuple(shapes.shape)}, expected {(len(images), *self.mean.shape)}")
         return self.refined(images, shapes.to(self.mean))
 
+    @full_precision
     def refined(self, images: Tensor, shapes: Tensor) -> Tensor:
         """As :meth:`refine`; one image (1,1,H,W) may serve all faces."""
         for cascade in range(self.sizes["cascades"]):  # each starts where the one before ended
