@@ -96,13 +96,14 @@ def relative_place(
     (K1, d1), (K2, d2) = ((x.intrinsics.numpy(), x.distortion.numpy()) for x in (one, other))
     points, size = board.points.numpy(), (one.width, one.height)
     seen = [corners.numpy().reshape(-1, 1, 2) for corners in first]
-    # After half a turn of a camera, some boards' corners are found from the other end on.
-    ways = [np.stack([corners.numpy(), corners.numpy()[::-1]]) for corners in then]
+    # A turned camera's corners may be found from another end on, those of a square board also by its columns.
+    grid, quarters = (board.rows, board.columns, 2), (0, 1, 2, 3) if board.rows == board.columns else (0, 2)
+    ways = [np.stack([np.rot90(c.numpy().reshape(grid), q).reshape(-1, 2) for q in quarters]) for c in then]
     boards = [_rigid(cv2.solvePnP(points, corners, K1, d1)[1:]) for corners in seen]
     before = np.concatenate([points @ R.T + t for R, t in boards])
 
     def off(R: np.ndarray, t: np.ndarray) -> np.ndarray:
-        """How far each moment's corners (M,), taken each way (M,2), are from where a place of the camera has them."""
+        """How far each moment's corners (M,), taken each way (M,W), are from where a place of the camera has them."""
         shown = cv2.projectPoints(before @ R.T + t, np.zeros(3), np.zeros(3), K2, d2)[0].reshape(len(ways), 1, -1, 2)
         return np.linalg.norm(shown - np.stack(ways), axis=-1).mean(-1)
 
