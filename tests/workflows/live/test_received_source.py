@@ -23,15 +23,13 @@ from received_frames import decode_frame
 from torchface import load_take
 from torchface.capture.anybody import WebcamControls
 from torchface.cli import main
-from torchface.io.protocols.live_link_packets import LiveLinkPackets
 from torchface.io.protocols.live_link_recordings import recorded_packets
-from torchface.io.protocols.osc_messages import osc_bundles, osc_message
 from torchface.io.protocols.received_face import ReceivedFace
 from torchface.shape_names import ARKIT
-from torchface.workflows.live import live_session, received_source
+from torchface.workflows.live import live_session
 from torchface.workflows.live.live_anybody import LiveSettings, go_live
 from torchface.workflows.live.live_figures import LiveFigures
-from torchface.workflows.live.received_source import ReceivedSolver, ReceivedSource, ReceivedWatch
+from torchface.workflows.live.received_source import ReceivedSolver, ReceivedSource
 from torchface.workflows.live.session_prompts import STEPS
 
 _LIMIT = 120.0  # seconds, of a session that the phone ends before
@@ -233,103 +231,6 @@ def test_a_guided_calibration_says_which_poses_were_not_held() -> None:
     assert solver.step(PICTURE, 1 / 60, WebcamControls(reset=True)).calibrated < 0.1
 
 
-def test_the_status_line_says_who_sends_what_is_lost_and_that_it_ended() -> None:
-    packets, said = LiveLinkPackets(ARKIT, 60.0, "iPhone"), list[str]()
-    source = ReceivedSource("livelink://127.0.0.1:0")
-    try:
-        watch, frames = ReceivedWatch(source, said.append), source.frames()
-
-        def shown(packet: bytes | None) -> str:
-            if packet is not None:
-                with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-                    sender.sendto(packet, ("127.0.0.1", source.receiver.port))
-            came, picture = next(frames)
-            watch.look(picture, True, came)
-            return watch.words
-
-        assert shown(None).startswith("Waiting for a face at port")
-        whole = [packets(torch.zeros(52), None)[0] for _ in range(6)]
-        assert "1 not understood (found version 9" in shown(b"\x09" + whole[0][1:])
-        assert shown(whole[0]).startswith("Receiving from iPhone 127.0.0.1")
-        shown(whole[1])
-        assert "2 lost" in shown(whole[4])
-        source.heard -= 3.0
-        assert "the last expression is held, then relaxes (3 s)" in shown(None)
-        assert "sees no face" in shown(whole[5][: -61 * 4 - 1])
-    finally:
-        source.close()
-    assert len(said) == len(set(said)) == 5
-
-
-@contextmanager
-def listening(address: str) -> Iterator[tuple[ReceivedSource, ReceivedWatch, list[str]]]:
-    source, said = ReceivedSource(address), list[str]()
-    try:
-        yield source, ReceivedWatch(source, said.append), said
-    finally:
-        source.close()
-
-
-def test_where_nothing_arrives_it_is_said_once_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(received_source, "own_address", lambda: "192.168.1.5")
-    monkeypatch.setattr(received_source, "other_addresses", lambda: ["10.0.0.7"])
-    with listening("livelink://:0") as (source, watch, said):
-        at = f"port {source.receiver.port} (UDP): have the app send to 192.168.1.5"
-        for now in (1000.0, 1004.9, 1005.0, 1006.0, 1100.0):
-            watch.look(PICTURE, SimpleNamespace(), now)
-        assert said == [
-            f"Waiting for a face at {at}",
-            f"For 5 seconds no packet has come to {at} (or to 10.0.0.7, whichever is in its network). A firewall on "
-            "this machine may hold packets back",
-        ]
-        assert watch.words == said[1]
-
-
-@pytest.mark.parametrize(
-    ("address", "packet", "kind"),
-    [
-        (
-            "livelink",
-            osc_message("/face/jawOpen", 0.5),
-            "OSC; osc://:{} receives those · 3 not understood (found version",
-        ),
-        ("livelink", osc_bundles([osc_message("/VMC/Ext/Blend/Apply")])[0], "VMC; vmc://:{} receives those"),
-        ("osc", osc_bundles([osc_message("/VMC/Ext/Blend/Val", "A", 0.5)])[0], "VMC; vmc://:{} receives those"),
-        ("osc", LiveLinkPackets(ARKIT, 60.0)(torch.zeros(52), None)[0], "Live Link Face; livelink://:{} receives"),
-        ("vmc", b"mouthSmile_R-5|eyeBlink_L-10|", "iFacialMocap; ifacialmocap://:{} receives those"),
-        ("livelink", b'{"a": 1}', "text ('{{\"a\": 1}}') · 3 not understood"),
-        ("livelink", b"\x09\xff\x00\x01more", "bytes 09 ff 00 01 · 3 not understood"),
-    ],
-)
-def test_packets_of_another_protocol_are_counted_and_named(address: str, packet: bytes, kind: str) -> None:
-    with listening(f"{address}://127.0.0.1:0") as (source, watch, said):
-        watch.look(PICTURE, SimpleNamespace(), 0.0)
-        frames, port = source.frames(), source.receiver.port
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            for _ in range(3):
-                sender.sendto(packet, ("127.0.0.1", port))
-        next(frames)
-        watch.look(PICTURE, SimpleNamespace(), 5.0)
-        expected = f"For 5 seconds no face has come, but packets (3) that look like {kind.format(port)}"
-        assert watch.words.startswith(expected)
-        assert said[-1] == watch.words
-        assert source.silence.startswith("no face has come, but packets (3)")
-
-
-@pytest.mark.parametrize(
-    ("address", "hint"),
-    [
-        ("livelink://127.0.0.1:0", "which only this machine reaches; for a phone, start with livelink://:{}"),
-        ("vmc://localhost:0", "which only this machine reaches; for a phone, start with vmc://:{}"),
-        ("ifacialmocap://127.0.0.1:49983", "ifacialmocap://127.0.0.1:49983 is asked to send; open iFacialMocap there"),
-    ],
-)
-def test_where_a_phone_cannot_reach_the_hint_says_what_to_type(address: str, hint: str) -> None:
-    with listening(address) as (source, watch, _):
-        assert watch.words.endswith(hint.format(source.receiver.port))
-        assert "have the app send to" not in watch.words
-
-
 def test_a_session_that_nobody_sends_to_says_so(dome: Path, tmp_path: Path) -> None:
     settings = LiveSettings("livelink://:0", dome, record=tmp_path / "out", page=False, seconds=0.3)
     report, (saved,) = go_live(settings, print, print, lambda progress: pytest.fail("no solver is needed"))
@@ -337,48 +238,6 @@ def test_a_session_that_nobody_sends_to_says_so(dome: Path, tmp_path: Path) -> N
     assert " s no packet has come to port " in words
     assert saved.error == "received no face, expected one"
     assert not list((tmp_path / "out").glob("*.csv"))
-
-
-def test_only_the_newest_of_several_faces_is_given_unless_every_one_is_recorded() -> None:
-    packets = LiveLinkPackets(ARKIT, 60.0)
-    for every, expected in ((False, [0.5]), (True, [0.1, 0.2, 0.3, 0.4, 0.5])):
-        source = ReceivedSource("livelink://127.0.0.1:0", every)
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-            for i in range(1, 6):
-                sender.sendto(packets(torch.full((52,), i / 10), None)[0], ("127.0.0.1", source.receiver.port))
-        frames, found = source.frames(), []
-        for _ in expected:
-            next(frames)
-            found.append(round(source.face.weights[0].item(), 3))
-        source.close()
-        assert found == expected
-        assert source.dropped == 5 - len(expected)
-
-
-def test_what_came_while_a_character_was_read_is_no_frame() -> None:
-    packets = LiveLinkPackets(ARKIT, 60.0)
-    with (
-        listening("livelink://127.0.0.1:0") as (source, _, _),
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender,
-    ):
-        for i in range(1, 6):
-            if i == 5:
-                source.skip()
-            sender.sendto(packets(torch.full((52,), i / 10), None)[0], ("127.0.0.1", source.receiver.port))
-        next(source.frames())
-        assert source.face.weights[0].item() == pytest.approx(0.5)
-        assert source.dropped == 0
-
-
-def test_weights_that_come_one_by_one_are_one_frame_of_a_recording() -> None:
-    source = ReceivedSource("osc://127.0.0.1:0", every=True)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for i, name in enumerate(ARKIT):
-            sender.sendto(osc_message(f"/face/{name}", i / 64), ("127.0.0.1", source.receiver.port))
-    next(source.frames())
-    source.close()
-    torch.testing.assert_close(source.face.weights, torch.arange(52) / 64)
-    assert source.dropped == 0
 
 
 @pytest.mark.parametrize(

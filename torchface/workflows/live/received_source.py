@@ -44,6 +44,7 @@ class ReceivedSource:
         self._in_parts = self.receiver.scheme == "osc"  # where each weight may come in a packet of its own
         self.face: ReceivedFace | None = None
         self.fresh, self.heard = False, float("-inf")
+        self._waited = False  # whether ``face`` came before the first frame
         self._picture = np.empty((0, 0, 3), np.uint8)
 
     def frames(self) -> Iterator[tuple[float, np.ndarray]]:
@@ -55,20 +56,24 @@ class ReceivedSource:
                 self.dropped += 0 if self._in_parts else len(faces) - 1
                 faces = faces[-1:]
             for came, face in faces:
-                self.face, self.fresh, self.heard = face, True, came
+                self.face, self.fresh, self.heard, self._waited = face, True, came, False
                 yield came, self._picture
                 wait = _SILENT
             if not faces:
                 now = time.perf_counter()
-                self.fresh = False
+                self.fresh, self._waited = self._waited, False
                 wait = _TICK if now - self.heard < _RESTS else _WAIT
                 yield now, self._picture
 
     def skip(self) -> None:
-        """Leaves out what came since the address was opened: it has waited and would come as one."""
+        """Leaves out what came since the address was opened: it has waited and would come as one.
+
+        The last face is the first frame where none comes soon: some programs send only what changes.
+        """
         for _ in range(_LOOKS):
-            if not self.receiver.faces(0.0):
+            if not (faces := self.receiver.faces(0.0)):
                 break
+            (self.heard, self.face), self._waited = faces[-1], True
 
     @property
     def place(self) -> str:
@@ -179,7 +184,7 @@ class ReceivedWatch:
             if late and (counts.packets or not self._silence):  # to look addresses up may take a second
                 self._silence = f"For {_PATIENCE:g} seconds {source.silence}"
             words = self._silence if late else self._waiting
-            state = counts.fault + (f" after {_PATIENCE:g} s {packet_kind(counts.first)}" if late else "")
+            state = counts.fault + (f" after {_PATIENCE:g} s {packet_kind(counts.first)[1]}" if late else "")
         elif source.fresh and not source.face.found:
             state = words = f"{source.receiver.sender}: connected, but sees no face: the last expression is held"
         elif source.fresh or now - source.heard < _HOLD:
