@@ -5,7 +5,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.number_checks import as_tensor, checked_number
-from torchface.optim.box_checks import as_vectors
+from torchface.optim.box_checks import as_vectors, check_finite
 from torchface.optim.implicit import SimplexSolution
 from torchface.optim.simplex_active_set import Mixture, SimplexProblems, solve_simplex
 
@@ -139,8 +139,6 @@ def _check_vectors(H: Tensor, f: Tensor, start: Tensor | None) -> None:
         raise ValueRangeError(f"simplex_qp: found {H.dtype} and {f.dtype}, expected the same of both")
     if start is not None and start.shape != f.shape:
         raise ShapeError(f"simplex_qp: found start {tuple(start.shape)}, expected {tuple(f.shape)}")
-    for name, values in (("f", f), ("start", start)):
-        if values is not None and not bool(torch.isfinite(values.detach()).all()):
-            raise ValueRangeError(f"simplex_qp: {name} holds NaN or infinite entries, expected finite ones")
+    check_finite(f, start, "simplex_qp")
     if start is not None and start.numel() and not (float(start.amin()) >= 0 and float(start.sum(-1).amin()) > 0):
         raise ValueRangeError("simplex_qp: found a negative start or one of sum 0, expected points of the simplex")
