@@ -67,23 +67,16 @@ def checked_bounds(
     lower: float | Tensor, upper: float | Tensor, H: Tensor | None, name: str = "box_qp"
 ) -> tuple[Tensor, Tensor]:
     """Bounds in float64, (N,); numbers alone stay numbers where there is no H yet."""
-    given = {"lower": lower, "upper": upper}
-    bounds = {
-        which: torch.as_tensor(
-            bound if isinstance(bound, Real) else as_tensor(which, bound, "(N,), or a number"),
-            dtype=torch.float64,
-            device=None if H is None else H.device,
-        ).detach()
-        for which, bound in given.items()
-    }
-    size = (
-        H.shape[-1:] if H is not None else next((one.shape for one in bounds.values() if one.ndim == 1), torch.Size())
-    )
-    for which, bound in bounds.items():
+    bounds = []
+    for which, bound in (("lower", lower), ("upper", upper)):
+        if not isinstance(bound, Real):
+            bound = as_tensor(which, bound, "(N,), or a number")
+        bounds.append(torch.as_tensor(bound, dtype=torch.float64, device=None if H is None else H.device).detach())
+    size = max((bound.shape[:1] for bound in bounds), key=len) if H is None else H.shape[-1:]
+    for which, bound in zip(("lower", "upper"), bounds, strict=True):
         if bound.ndim and bound.shape != size:
-            wanted = size[0] if size else "N"
-            raise ShapeError(f"{name}: found {which} {tuple(bound.shape)}, expected a number or ({wanted},)")
-    low, high = (bound.expand(size).contiguous() for bound in bounds.values())
+            raise ShapeError(f"{name}: found {which} {tuple(bound.shape)}, expected a number or ({size[0]},)")
+    low, high = (bound.expand(size).contiguous() for bound in bounds)
     check_box(name, low, high)
     return low, high
 

@@ -110,11 +110,12 @@ class FixedSplitting(nn.Module):
         f = f.to(torch.promote_types(f.dtype, self.minus_step.dtype))
         if H is None and not len(self.offset):
             raise ShapeError(f"{_NAME}: found no H, expected one here or where the module is made")
+        H = None if H is None else as_tensor("H", H, "(B,N,N)").to(f)
         start = None if start is None else as_tensor("start", start, "(B,N)").to(f)
-        check_call((self.offset if H is None else as_tensor("H", H, "(B,N,N)")).to(f), f, start, _NAME, self.box[0])
+        check_call(self.offset.to(f) if H is None else H, f, start, _NAME, self.box[0])
         z = v = self._clip((torch.zeros_like(f) if start is None else start).to(self.minus_step))
         if H is not None:
-            return self._with_own(f, H.to(f) if H.ndim == 3 else H.to(f).expand(len(f), -1, -1), z)
+            return self._with_own(f, H if H.ndim == 3 else H.expand(len(f), -1, -1), z)
         constant = (f @ self.offset.to(f)).to(z)
 
         def step(v: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
