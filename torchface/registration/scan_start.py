@@ -98,9 +98,9 @@ def _pose_by_shape(
     if best >= _SURE_FIT:
         return best, pose, _other_heads(samples, face, scan, pose)
     note = (
-        f"the face was found by its shape alone and fits {best:.2f} of 1 there, where heads fit {_SURE_FIT} and more: "
-        "look at the registered mesh (torchface register writes NAME.glb and contact_sheet.png), and give landmarks if "
-        "it lies elsewhere"
+        f"warning: the face was found by its shape alone and fits {best:.2f} of 1 there, where heads fit {_SURE_FIT} "
+        "and more: look at the registered mesh (torchface register writes NAME.glb and contact_sheet.png), and give "
+        "landmarks if it lies elsewhere"
     )
     return best, pose, [note]
 
@@ -146,8 +146,8 @@ def _other_heads(samples: Samples, face: Samples, scan: ScanPoints, found: Simil
         for pose in (found, other)
     )
     return [
-        f"the face fits in more than one place: the one at {taken} was taken, another is at {not_taken}, millimetres; "
-        "cut the scan to one head, or give landmarks"
+        f"warning: the face fits in more than one place: the one at {taken} was taken, another is at {not_taken}, "
+        "millimetres; cut the scan to one head, or give landmarks"
     ]
 
 
@@ -157,8 +157,8 @@ def scale_notes(pose: Similarity) -> list[str]:
     if MIN_HEAD_SCALE <= scale <= MAX_HEAD_SCALE:
         return []
     return [
-        f"the template was aligned with the scan at {scale:.3g} times its size, heads differ by {MIN_HEAD_SCALE} to "
-        f"{MAX_HEAD_SCALE} times: are both in millimetres, and the landmarks this scan's?"
+        f"warning: the template was aligned with the scan at {scale:.3g} times its size, heads differ by "
+        f"{MIN_HEAD_SCALE} to {MAX_HEAD_SCALE} times: are both in millimetres, and the landmarks this scan's?"
     ]
 
 

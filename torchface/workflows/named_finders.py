@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import torch
 from torch import Tensor
@@ -69,7 +69,7 @@ def load_finder(
 
     Raises:
         NameMismatchError: there is none of this name, or it is of another kind.
-        ValueRangeError: it finds other landmarks than iBUG's 68.
+        ValueRangeError: it finds other landmarks than iBUG's 68, or ``shown`` is none of these.
         FileFormatError: it is damaged, or a graph of other inputs and outputs.
         MissingExtraError: a bundle is asked for, and LiteRT, which runs it, is not installed.
 
@@ -77,6 +77,8 @@ def load_finder(
         >>> load_finder("face_landmarks").finder.name
         'face_landmarks'
     """
+    if shown not in get_args(Shown):
+        raise ValueRangeError(f"shown: found {shown!r}, expected one of {', '.join(get_args(Shown))}")
     if Path(name_or_path).suffix.lower() == ".csv":
         raise NameMismatchError(f"{option}: found {name_or_path}, a table of landmarks, expected what finds them")
     if Path(name_or_path).suffix.lower() == BUNDLE:

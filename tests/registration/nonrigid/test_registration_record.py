@@ -1,5 +1,6 @@
 """What is said of a registration: whether it is to be used."""
 
+import math
 from dataclasses import replace
 
 from torchface.registration.nonrigid.registration_record import RegistrationRecord
@@ -16,6 +17,8 @@ def test_the_verdict_is_of_the_distance_of_the_stretch_and_of_warnings() -> None
         replace(NEAR, far_distance=1.4),
         replace(NEAR, stretch=0.52),
         replace(NEAR, notes=("warning: a",)),
+        replace(NEAR, slid=8.2),
+        replace(NEAR, far_distance=math.nan, stretch=math.nan),
     ):
         assert doubtful.verdict().startswith("result: partly usable, ")
     assert replace(NEAR, stretch=1.29).verdict().startswith("result: poor, ")

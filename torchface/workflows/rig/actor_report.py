@@ -36,7 +36,7 @@ class ActorReport:
         """For people to read."""
         record = self.neutral.record
         lines = [f"neutral: aligned with the scan by {record.start}; {record.figures()}"]
-        lines += [f"  note: {note}" for note in record.notes]
+        lines += [f"  {remark}" for remark in record.remarks]
         if not record.bent:
             lines = [f"neutral: {note}" for note in record.notes]
         lines.insert(0, self.verdict())
