@@ -60,12 +60,20 @@ def small() -> LandmarkNetwork:
 
 
 @pytest.mark.parametrize("workers", [0, 1])
-def test_files_give_what_memory_gives(files: list[Path], workers: int) -> None:
-    settings = NetworkSettings(steps=3, batch=4, workers=workers)
+def test_files_give_what_memory_gives_also_after_a_stop(files: list[Path], workers: int, tmp_path: Path) -> None:
+    settings = NetworkSettings(steps=3, batch=4, workers=workers, checkpoint_every=0)
+
+    def stop(_: str, done: int = 0, total: int = 0) -> None:
+        if done == 2:
+            raise KeyboardInterrupt
+
     parts = [load_file(path) for path in files]
     held = (torch.cat([part[name] for part in parts])[:5] for name in ("rgba", "landmarks", "visible"))
     expected = LandmarkNetwork.fit(TensorDataset(*held), small(), settings).state_dict()
-    found = LandmarkNetwork.fit(StoredPictures(files, 5), small(), settings).state_dict()
+    with pytest.raises(KeyboardInterrupt):
+        LandmarkNetwork.fit(StoredPictures(files, 5), small(), settings, stop, tmp_path / "part")
+    assert (tmp_path / "part").exists()
+    found = LandmarkNetwork.fit(StoredPictures(files, 5), small(), settings, None, tmp_path / "part").state_dict()
     for name, value in expected.items():
         torch.testing.assert_close(found[name], value, rtol=0, atol=0, msg=name)
 
