@@ -240,7 +240,7 @@ def test_a_steep_slope_leads_to_the_bounds(steepness: float) -> None:
     assert torch.equal(box_qp(H, f * steepness), (f < 0).double())
 
 
-def test_the_module_follows_its_hessian() -> None:
+def test_the_module_follows_its_hessian_and_precision() -> None:
     H = hessian(8, 0.5, 20.0)
     f, _ = planted(H, 5)
     qp = BoxQP(torch.nn.Parameter(H.clone()), lower=-1.0)
@@ -258,6 +258,9 @@ def test_the_module_follows_its_hessian() -> None:
     torch.testing.assert_close(qp(f), wanted, rtol=0, atol=1e-9)
     qp.H.data.mul_(3.0)
     torch.testing.assert_close(qp(f), box_qp(3.0 * other.H, f, -2.0, 0.5), rtol=0, atol=1e-9)
+    single = BoxQP(H.float())
+    single(f.float())
+    torch.testing.assert_close(single.double()(f), box_qp(H.float().double(), f), rtol=0, atol=1e-10)
 
 
 def test_a_hessian_that_becomes_indefinite_is_refused() -> None:
