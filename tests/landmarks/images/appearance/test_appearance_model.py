@@ -106,6 +106,15 @@ def test_extreme_faces_are_found_from_a_start_that_leans_to_rest(film: PortraitV
     assert (fit.error < fit.initial_error).all()
 
 
+def test_extreme_faces_have_at_most_six_tenths_of_the_trees_error(film: PortraitVideo, model: AppearanceModel) -> None:
+    truth = film.landmarks[TRAINED:]
+    trees = zoo.get_model("face_landmarks")
+    with torch.no_grad():
+        start = trees(images(film), box_around(truth))
+    fit = model.refine(images(film), start)
+    assert mean_error(fit.landmarks, truth).mean() <= 0.6 * mean_error(start, truth).mean()
+
+
 def test_the_error_tells_a_good_fit_from_a_bad_one(film: PortraitVideo, model: AppearanceModel) -> None:
     truth = film.landmarks[TRAINED:]
     good = model.error(images(film), truth)
