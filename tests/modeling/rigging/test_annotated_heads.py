@@ -54,3 +54,20 @@ def test_an_eye_of_its_own_is_an_eyeball_from_front_to_back() -> None:
     label = components(head.neutral.faces, len(head.vertices))
     eye = label == label[place[ball]].mode().values
     assert bool(found[eye].all())
+
+
+def test_loose_parts_in_the_mouth_as_narrow_as_teeth_are_teeth() -> None:
+    """Also those that stand beside the template's mouth, next to another; a stud in the ear is none."""
+    person = performer(texture=False)
+    inside = person.neutral.annotations.regions["mouth_interior"]
+    front = person.vertices[inside][person.vertices[inside][:, 2].argmax()] - torch.tensor([0.0, 0, 2])
+    corners = torch.tensor([[0.0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4]])
+    places = [front, front + torch.tensor([5.0, 0, 0]), front + torch.tensor([10.0, 0, 0]), person.vertices[:, 0].max()]
+    parts = torch.cat([corners + place for place in places])
+    count, sides = len(person.vertices), torch.tensor([[0, 1, 2], [0, 2, 3], [0, 3, 1], [1, 3, 2]])
+    faces = torch.cat([person.neutral.faces, *(count + 4 * k + sides for k in range(4))])
+    deltas = torch.cat([person.deltas, person.deltas.new_zeros(len(person.names), 16, 3)], 1)
+    head = BlendshapeRig(Mesh(torch.cat([person.vertices, parts]), faces), deltas, person.names)
+    regions = annotations_on(head, person, SAME).regions
+    assert regions["teeth"].nonzero()[:, 0].tolist() == list(range(count, count + 12))
+    assert not bool((regions["mouth_interior"] & regions["teeth"]).any())

@@ -13,6 +13,8 @@ from torchface.rig import BlendshapeRig
 
 _BESIDE = 4.0  # millimetres at the template's size
 _EYEBALL, _MOST = "eyeball", 0.4  # of a part's vertices
+_MOUTH, _TEETH = "mouth_interior", "teeth"
+_TOOTH, _NEXT_TOOTH = 15.0, 3.0  # millimetres at the template's size: a tooth's width at most, and the gap to the next
 _TELLING = ("jawOpen", *BLINKS)  # which of lips and lids that touch a vertex is of, its motion says
 
 
@@ -43,8 +45,31 @@ def annotations_on(head: BlendshapeRig, template: BlendshapeRig, pose: Similarit
             if name.startswith(_EYEBALL):  # an eye of its own is one from front to back
                 share = part.bincount(inside.double()) / part.bincount()
                 inside = torch.where(part == skin, inside, share[part] > _MOST)
+            if name == _MOUTH and not any(_TEETH in known for known in regions):
+                teeth = _teeth(rest, part, inside & (part != skin))
+                inside &= ~teeth
+                regions |= {_TEETH: teeth} if teeth.any() else {}
             regions[name] = inside
     return Annotations(landmarks, regions, own.mirror, own.contacts)
+
+
+def _teeth(rest: Tensor, part: Tensor, inside: Tensor) -> Tensor:
+    """Vertices (V,) of loose parts as narrow as a tooth that lie mostly in the mouth, and of those next to them."""
+    count = int(part.max()) + 1
+    low, high = (
+        rest.new_full((count, 3), size).scatter_reduce(0, part[:, None].expand(-1, 3), rest, way)
+        for size, way in ((torch.inf, "amin"), (-torch.inf, "amax"))
+    )
+    narrow = ((high - low)[:, ::2].amax(1) < _TOOTH)[part]  # across and in depth: some have roots
+    found = narrow & ((part.bincount(inside.double(), count) / part.bincount(minlength=count)) > _MOST)[part]
+    while found.any():
+        others = (narrow & ~found).nonzero()[:, 0]
+        gaps = torch.from_numpy(cKDTree(rest[found].numpy()).query(rest[others].numpy())[0])
+        near = others[gaps < _NEXT_TOOTH]
+        if not len(near):
+            break
+        found |= torch.isin(part, part[near])
+    return found
 
 
 def on_face(template: BlendshapeRig, registration: Registration) -> BlendshapeRig:
