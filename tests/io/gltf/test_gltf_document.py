@@ -204,7 +204,7 @@ def test_a_glb_without_morph_targets_is_a_mesh_but_no_rig(tmp_path: Path) -> Non
     del build.root["meshes"][0]["primitives"][0]["targets"]
     path = build.save(tmp_path / "face.gltf")
     assert len(load_mesh(path).vertices) == 4
-    with pytest.raises(FileFormatError, match=r"face.gltf: found no morph target in its one mesh, expected"):
+    with pytest.raises(FileFormatError, match=r"face.gltf: found no morph target in its one mesh.*torchface rig"):
         load_rig(path)
 
 

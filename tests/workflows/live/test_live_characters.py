@@ -47,7 +47,7 @@ def test_characters_that_cannot_move(dome_rig: BlendshapeRig, tmp_path: Path, mo
     from torchface import save_mesh
 
     save_mesh(dome_rig.neutral, tmp_path / "statue.glb")
-    with pytest.raises(FileFormatError, match=r"statue.glb: found no morph target"):
+    with pytest.raises(FileFormatError, match=r"statue.glb: found no morph target.*torchface rig .*arkit"):
         load_character(tmp_path / "statue.glb")
     save_rig(dome_rig, tmp_path / "dome.glb")
     whole = (tmp_path / "dome.glb").read_bytes()

@@ -15,6 +15,7 @@ from torchface import BlendshapeRig, Mesh, load_rig
 from torchface.cli import main
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
+from torchface.io import save_mesh
 from torchface.io.gltf.character_scene import Character, read_character
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.vrm.vrm_expressions import vrm_expressions
@@ -203,6 +204,11 @@ def test_files_that_are_no_characters_are_refused(tmp_path: Path) -> None:
     (tmp_path / "my hero.obj").touch()
     with pytest.raises(FileFormatError, match=r"torchface arkit '.*my hero\.obj' --out 'my hero\.glb'"):
         check_character(tmp_path / "my hero.obj")
+    for scale, unit in ((1.0, ""), (0.1, "--unit cm "), (0.001, "--unit m ")):
+        head = performer(texture=False).neutral
+        save_mesh(head.with_vertices(scale * head.vertices), tmp_path / "head.obj")
+        with pytest.raises(FileFormatError, match=rf"gets ARKit's shapes by: torchface arkit .*head\.obj {unit}--out"):
+            check_character(tmp_path / "head.obj")
 
 
 def test_options_of_scans_are_refused_for_a_character(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

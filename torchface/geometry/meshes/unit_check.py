@@ -15,6 +15,8 @@ _UNITS = {
     10.0: ("in millimetres and were read as centimetres", "leave the unit out"),
     1e3: ("in millimetres and were read as metres", "leave the unit out, or say --unit mm"),
 }
+LEAST_OF_A_HEAD = 0.3
+"""A face's extent in a head's, below which its unit is doubted."""
 _NEAR = 6.0  # a scan may show less than the other mesh, or more
 
 
@@ -34,8 +36,7 @@ def check_unit(
     ratio = size / max(beside, 1e-30)
     if least <= ratio <= most:
         return
-    nearest = min(_UNITS, key=lambda unit: abs(math.log(max(ratio, 1e-30) / unit)))
-    near = 1 / _NEAR < ratio / nearest < _NEAR
+    nearest, near = _nearest(ratio)
     unit, cure = _UNITS[nearest]
     cure = f"scale this one by {1 / nearest:g}" if alone else cure
     looks = f"; it looks as if the lengths were {unit} ({cure})" if near else ""
@@ -43,3 +44,16 @@ def check_unit(
         f"{name}: found an extent of {size:.4g} mm beside {what} of {beside:.4g} mm{looks}; "
         "expected both in millimetres"
     )
+
+
+def likely_unit(points: Tensor, beside: float) -> str | None:
+    """The unit, m or cm, that points (n,3) are in as their size beside a head's says; None where it may be mm."""
+    ratio = extent(points) / beside
+    nearest, near = _nearest(ratio)
+    return {1e-3: "m", 0.1: "cm"}.get(nearest) if near and ratio < LEAST_OF_A_HEAD else None
+
+
+def _nearest(ratio: float) -> tuple[float, bool]:
+    """The unit that explains a ratio of sizes best, and whether it does."""
+    nearest = min(_UNITS, key=lambda unit: abs(math.log(max(ratio, 1e-30) / unit)))
+    return nearest, 1 / _NEAR < ratio / nearest < _NEAR

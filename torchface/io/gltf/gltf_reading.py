@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.color_space import to_srgb
-from torchface.errors import FileFormatError, MissingExtraError, NoShapesError
+from torchface.errors import FileFormatError, MissingExtraError
 from torchface.geometry.meshes.uv_seams import merge_equal_rows
 from torchface.io.gltf.corrective_extras import rig_of_targets, scene_correctives
 from torchface.io.gltf.gltf_document import Document, read_document
@@ -32,6 +32,7 @@ from torchface.io.images.image_files import decode_image
 from torchface.io.images.ktx2_images import is_ktx2, ktx2_reader
 from torchface.io.images.texture_atlas import Look, with_used_looks
 from torchface.io.length_units import millimetres_per
+from torchface.io.scenes.missing_shapes import no_shapes, no_target
 from torchface.io.scenes.scene_pieces import Piece, all_names, join_deltas, join_meshes, joined_size
 from torchface.mesh import Annotations, Mesh
 from torchface.rig import BlendshapeRig
@@ -51,9 +52,7 @@ def read_gltf_rig(path: str | Path, unit: str = "m") -> BlendshapeRig:
     document = read_document(path)
     neutral, deltas, names = _read(document, millimetres_per(unit))
     if not names:
-        count = len(document.objects("meshes"))
-        meshes = f"its {count} meshes" if count != 1 else "its one mesh"
-        raise NoShapesError(f"{path}: found no morph target in {meshes}, expected at least one for a rig")
+        raise no_shapes(path, no_target(len(document.objects("meshes"))))
     return rig_of_targets(document, neutral, deltas, names, scene_correctives(document))
 
 

@@ -7,12 +7,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.errors import FileFormatError, NameMismatchError, NoShapesError, ShapeError
+from torchface.errors import FileFormatError, NameMismatchError, ShapeError
 from torchface.files.whole_files import checked_size
 from torchface.geometry.meshes.normal_maps import DetailMaps, decode_normals
 from torchface.io.images.image_files import decode_image
 from torchface.io.scene_processes.reading_process import read_scene
 from torchface.io.scene_processes.scene_arrays import Scene, mesh_transform, scene_mesh, scene_rig, scene_weights
+from torchface.io.scenes.missing_shapes import no_shapes
 from torchface.io.usd.usd_library import require_usd
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
@@ -36,7 +37,7 @@ def read_usd_rig(path: str | Path, unit: str | None = None) -> BlendshapeRig:
     """
     rig = scene_rig(read_stage(path), unit)
     if rig is None:
-        raise NoShapesError(f"{path}: found no blend shape on its meshes, expected at least one for a rig")
+        raise no_shapes(path, "no blend shape on its meshes")
     return rig
 
 

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import AlignmentError, FileFormatError, NoShapesError, ValueRangeError
-from torchface.geometry.meshes.unit_check import check_unit, extent
+from torchface.geometry.meshes.unit_check import LEAST_OF_A_HEAD, check_unit, extent
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io import HeadModelFile, load_head_model_file, load_mesh, load_rig
 from torchface.io.blender import BLENDER_ENDINGS
@@ -33,7 +33,7 @@ _HEAD, _BODY = 330.0, 600.0
 """Millimetres: of a mesh taller than the second the uppermost first are the head."""
 _MEDIAN_LIMIT, _STRETCH_LIMIT = 3.0, 1.0
 _LEAST_TRIANGLES = 50
-_EXTENTS, _SIZES = (0.3, 8.0), (0.5, 2.0)
+_EXTENTS, _SIZES = (LEAST_OF_A_HEAD, 8.0), (0.5, 2.0)
 """A source's extent in the template's, and its head's size, in which its unit is not doubted."""
 _GIVE = "give the face's landmarks (--landmarks FILE, from torchface pick)"
 

@@ -13,13 +13,14 @@ from torch import Tensor
 
 from torchface.capture.retargeting import ShapeMap, ShapeRule, load_shape_rules, shape_map
 from torchface.correctives.activation import CorrectiveActivation
-from torchface.errors import FileFormatError, NameMismatchError, NoShapesError
+from torchface.errors import FileFormatError, NameMismatchError
 from torchface.files.whole_files import read_file
 from torchface.geometry.meshes.normal_maps import SurfaceMaps
 from torchface.io import load_rig, save_rig
 from torchface.io.gltf.corrective_extras import scene_correctives
 from torchface.io.gltf.gltf_document import Document, document_of
 from torchface.io.gltf.primitive_reading import moving_target_names, read_target_names
+from torchface.io.scenes.missing_shapes import no_shapes, no_target
 from torchface.io.tables.csv_table import quoted
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
@@ -157,9 +158,7 @@ def _shapes(document: Document, followers: set[str]) -> tuple[str, ...]:
     meshes = [read_target_names(document, i) for i in range(len(document.objects("meshes")))]
     names = tuple(dict.fromkeys(name for mesh in meshes for name in mesh if name not in followers))
     if not names:
-        raise NoShapesError(
-            f"{document.path}: found no morph target in its {len(meshes)} meshes, expected at least one for a rig"
-        )
+        raise no_shapes(document.path, no_target(len(meshes)))
     return names
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from shlex import quote
@@ -11,16 +12,17 @@ from typing import Any
 
 import torch
 
-from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
+from torchface.errors import AlignmentError, FileFormatError, TorchfaceError, ValueRangeError
 from torchface.files.job_lock import file_lock
 from torchface.files.whole_files import all_or_none, check_ending, check_there
+from torchface.geometry.meshes.unit_check import extent, likely_unit
 from torchface.io.gltf.character_annotations import annotate_character
 from torchface.io.gltf.character_scene import Character, read_character
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.morph_insertion import document_with_targets, rename_targets, write_edited
 from torchface.io.gltf.part_insertion import document_with_parts
 from torchface.io.images.image_files import IMAGE_ENDINGS, encode_png
-from torchface.io.mesh_files import MESH_ENDINGS
+from torchface.io.mesh_files import MESH_ENDINGS, load_mesh
 from torchface.io.vrm.vrm_expressions import VRM_ENDING, add_expressions
 from torchface.landmarks.surfaces.face_on_surface import NoFaceOnSurfaceError
 from torchface.modeling import CarriedShapes, shapes_on
@@ -184,14 +186,22 @@ def check_character(path: Path) -> None:
     if ending not in CHARACTER_ENDINGS:
         if ending not in _CONVERT:
             check_there(path)
-        bare = f"a mesh alone gets them by: torchface arkit {quote(str(path))} --out {quote(path.stem + '.glb')}"
-        converted = bare if ending in MESH_ENDINGS else "export it as .glb"
+        converted = _by_arkit(path) if ending in MESH_ENDINGS else "export it as .glb"
         # The output is named without the input's folder, which may be closed.
         names = {"quoted": quote(str(path)), "made": quote(f"{path.stem}.glb")}
         how = _CONVERT[ending].format(path=path, stem=path.stem, **names) if ending in _CONVERT else converted
         raise FileFormatError(
             f"{path}: found {ending!r}, expected a character's .glb, .vrm or USD ({how}), or --template for a scan"
         )
+
+
+def _by_arkit(path: Path) -> str:
+    """The command that gives a mesh ARKit's shapes, with the unit that its size says where it is not the format's."""
+    unit = None
+    with suppress(TorchfaceError):  # what is wrong with the mesh that command says
+        unit = likely_unit(load_mesh(path).vertices, extent(performer(texture=False).vertices))
+    words = f"torchface arkit {quote(str(path))}" + (f" --unit {unit}" if unit else "")
+    return f"a head mesh alone gets ARKit's shapes by: {words} --out {quote(path.stem + '.glb')}"
 
 
 def _copied(
