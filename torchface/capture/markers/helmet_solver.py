@@ -8,8 +8,9 @@ from torch import Tensor, nn
 from torchface.attachment import Attachment
 from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
 from torchface.capture.energy import Quadratic, chunks_of_frames, marker_term
+from torchface.capture.markers.given_markers import frames_seen, markers_of
 from torchface.capture.markers.helmet_motion import HelmetMotion, rigid_columns, rigid_rotation, rough_motion
-from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver, frames_seen, markers_of
+from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver
 from torchface.errors import ShapeError
 from torchface.geometry.similarity import Similarity
 from torchface.optim import BoxQP, box_qp

@@ -7,7 +7,8 @@ from torch import Tensor, nn
 
 from torchface.capture.corrective_energy import CorrectiveEnergy, least_in_box
 from torchface.capture.energy import Quadratic, chunks_of_frames, pull_term
-from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen
+from torchface.capture.markers.given_markers import frames_seen
+from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, checked_number, checked_type
 from torchface.optim.box_checks import default_tolerance

@@ -20,6 +20,7 @@ from torchface.capture.energy import (
     ridge_term,
     sparsity_term,
 )
+from torchface.capture.markers.given_markers import check_labels, check_seen, frames_seen, markers_of
 from torchface.correctives.activation import CorrectiveActivation
 from torchface.correctives.corrective_shapes import Corrective, definitions_from_records
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
@@ -279,7 +280,7 @@ class MarkerSolver(nn.Module):
             raise ShapeError(f"markers: found {tuple(markers.shape)}, expected (B,{len(self.rest)},3)")
         check_markers(markers)
         missing = torch.isnan(markers).any(-1)
-        _check_seen(missing)
+        check_seen(missing)
         tolerance = default_tolerance(markers.dtype)
         initial = None if initial is None else initial.double()
         weights = self._solved(markers, missing.any(-1), initial, tolerance)
@@ -439,39 +440,3 @@ class MarkerSolver(nn.Module):
 def penalty_value(penalty: float | Tensor) -> float:
     """The value of a solver's ``sparsity`` or ``ridge``, without its gradient."""
     return penalty.item() if isinstance(penalty, Tensor) else penalty
-
-
-def check_labels(found: Sequence[str], known: Sequence[str]) -> None:
-    """Raises ``NameMismatchError`` for marker labels that an attachment does not know, or where it knows none."""
-    unknown = sorted(set(found) - set(known))
-    if unknown or not found:
-        shown = ", ".join(map(repr, unknown[:5])) or "no marker at all"
-        raise NameMismatchError(
-            f"markers: found {shown}{' and others' if len(unknown) > 5 else ''}, expected labels of the attachment: "
-            f"{', '.join(known[:5])}, ...; drop markers that are not of the face with Track.select"
-        )
-
-
-def markers_of(take: Take) -> Track:
-    """The markers of a take, which it must have."""
-    if checked_type("take", take, Take).markers is None:
-        raise NameMismatchError("take: has no markers, expected a track of them")
-    return take.markers  # type: ignore[return-value]
-
-
-def frames_seen(markers: Tensor) -> Tensor:
-    """The frames of markers (T,M,3) that show at least one, (K,) int64."""
-    rows = (~torch.isnan(markers).any(-1)).any(-1).nonzero()[:, 0]
-    if not len(rows):
-        raise ValueRangeError(f"markers: found none in any of {len(markers)} frames, expected some")
-    return rows
-
-
-def _check_seen(missing: Tensor) -> None:
-    empty = missing.all(-1).nonzero()[:, 0].tolist()
-    if empty:
-        shown = ", ".join(map(str, empty[:10])) + (", ..." if len(empty) > 10 else "")
-        raise ValueRangeError(
-            f"markers: all {missing.shape[1]} are missing in {len(empty)} of {len(missing)} frames ({shown}); "
-            "expected at least one seen in every frame: cut these frames or fill them first"
-        )

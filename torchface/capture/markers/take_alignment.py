@@ -6,8 +6,9 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
+from torchface.capture.markers.given_markers import check_labels
 from torchface.capture.markers.helmet_motion import EXPRESSIONS, free_motion
-from torchface.capture.markers.marker_solver import MarkerSolver, check_labels
+from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.markers.rest_pose import (
     check_not_collinear,
     check_not_mirrored,

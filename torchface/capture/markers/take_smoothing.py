@@ -10,7 +10,8 @@ from scipy.fft import dct, idct
 from torch import Tensor, nn
 
 from torchface.capture.corrective_energy import CorrectiveEnergy
-from torchface.capture.markers.marker_solver import MarkerSolver, frames_seen, markers_of, penalty_value
+from torchface.capture.markers.given_markers import frames_seen, markers_of
+from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
 from torchface.errors import ShapeError, TraceError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, check_rate, checked_number, checked_type
 from torchface.optim.data_dependent import data_dependent

@@ -10,9 +10,9 @@ from torchface.attachment import Attachment
 from torchface.capture.markers.attachment.site_iterations import LAST_RIDGE, FitState, SiteSearch, SiteSolver
 from torchface.capture.markers.attachment.site_uncertainty import SiteUncertainty
 from torchface.capture.markers.frame_poses import MIN_MARKERS, rough_poses, solve_frames
+from torchface.capture.markers.given_markers import check_labels
 from torchface.capture.markers.helmet_motion import HelmetMotion
 from torchface.capture.markers.marker_labels import listed
-from torchface.capture.markers.marker_solver import check_labels
 from torchface.capture.markers.rest_pose import check_not_collinear, check_not_mirrored, inlier_markers, pose_of_points
 from torchface.capture.markers.rig_fit_check import DOUBTFUL_SHARE
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one

@@ -9,7 +9,8 @@ from torch import Tensor
 
 from torchface.capture.markers.cleaning.label_swaps import cycled_back, find_swaps, swapped_back, whole_take_exchanges
 from torchface.capture.markers.cleaning.robust_prediction import Prediction, predict_markers
-from torchface.capture.markers.marker_solver import MarkerSolver, markers_of
+from torchface.capture.markers.given_markers import markers_of
+from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.capture.markers.take_smoothing import WholeTakeSolver
 from torchface.take import Take, Track
 
