@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from torchface.registration import Registration, hidden_parts, in_place_of, with
 from torchface.registration.nonrigid.registration_record import RegistrationRecord
 from torchface.synthetic import neutral_head, performer
 from torchface.workflows.rig import actor_rig
+from torchface.workflows.rig.actor_report import ActorReport
 from torchface.workflows.rig.actor_rig import RigOptions, rig_actor
 
 PICKS = torch.arange(26, 600, 41)
@@ -90,7 +92,7 @@ def test_the_command_brings_the_planted_rig_back(actor: Actor, capsys: pytest.Ca
     told = " ".join(capsys.readouterr().err.split())
     for fact in (
         "aligned with the scan by landmarks",
-        "of what faces outward",
+        "of the template's outer side",
         "_registration.png",
         "4 shapes transferred",
         "examples: 1",
@@ -281,3 +283,11 @@ def test_what_is_drawn_of_a_registration_is_what_the_rig_has(tmp_path: Path, mon
 def test_details_for_a_file_without_a_place_for_them_are_refused_before_any_work(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"detail maps .* for a \.ma file"):
         rig_actor(tmp_path / "no.obj", tmp_path / "no.glb", tmp_path / "a.ma", detail=tmp_path)
+
+
+def test_the_report_names_the_shape_of_arkit_that_a_template_has_not() -> None:
+    record = RegistrationRecord("shape", 1.0, (), (), 0.1, 1.0, 1.0)
+    rig = performer(texture=False)
+    report = ActorReport(rig, SimpleNamespace(record=record), "", None, (), {}, (), Path("a.png"))
+    [line] = [line for line in report.lines() if line.startswith("rig: ")]
+    assert line.endswith("51 shapes transferred; not of ARKit's 52: tongueOut (the template has no such shape)")

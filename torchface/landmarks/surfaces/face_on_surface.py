@@ -31,7 +31,9 @@ _TRIED = 3  # places that are looked at from near
 _HOLE, _AROUND_OPENING = 0.5, 0.25  # of the eyes' distance: behind where a face has a point, and round eyes and mouth
 _OPENINGS = (slice(36, 42), slice(42, 48), slice(48, 68))
 _LOST = 0.07  # of the eyes' distance: what is off by more on the reference is no habit of the finder
-_PRESENCE, _MISFIT = 0.7, 0.35
+_PRESENCE = 0.7
+MISFIT = 0.35
+"""Of the eyes' distance: how far a face's landmarks may lie from a head's."""
 _DOUBT = 0.2  # above it other places are looked at too, from all around and in clay; most faces are below
 _FACE_OF_HEAD = 0.5  # side of the box round a face, in sides of a picture that frames the head
 
@@ -194,7 +196,7 @@ class FaceSearch:
         middle = pose.apply(self.reference.landmarks[INNER].double().mean(0)[None])[0, 0]
         size = float(pose.scale[0]) * eyes
         return _Sighting(
-            pose, middle, size, score * float(reading.presence) / (1 + (misfit / eyes / _MISFIT) ** 2), plain
+            pose, middle, size, score * float(reading.presence) / (1 + (misfit / eyes / MISFIT) ** 2), plain
         )
 
     def _from_near(
@@ -227,11 +229,11 @@ class FaceSearch:
         fit = fit[INNER.start :]
         misfit = float(fit[torch.isfinite(fit).all(-1)].square().sum(-1).mean().sqrt()) / eyes
         result = FaceOnSurface(points, pose, presence, misfit, tuple(views), others)
-        if not (presence >= _PRESENCE and misfit <= _MISFIT):
+        if not (presence >= _PRESENCE and misfit <= MISFIT):
             raise NoFaceOnSurfaceError(
                 f"found what looks like a face from afar but not from near: presence {presence:.2f} (expected at least "
                 f"{_PRESENCE:g}), its landmarks lie {misfit:.0%} of the eyes' distance from a head's (expected at most "
-                f"{_MISFIT:.0%})",
+                f"{MISFIT:.0%})",
                 views,
                 first.score if presence >= _PRESENCE else 0.0,
             )

@@ -52,16 +52,17 @@ class RegistrationRecord:
     slid: float = math.nan
     bent: bool = True  # False of a head that has the template's triangles and was taken as it is
 
-    def figures(self) -> str:
-        """How near it has come, how much of it the scan shows, and how far it has slid, in one line."""
+    def figures(self, of: str = "the scan") -> str:
+        """How near it has come, how much of it the scan shows, and how far it has slid, in one line; ``of`` says what
+        the scan is."""
         covered = f", {self.covered:.0%} lies under hair, cloth or a broken ear" if self.covered >= 0.005 else ""
-        slid = f"the scan's landmarks inside the face lie {self.slid:.1f} mm from the mesh's own (median)"
+        slid = f"{of}'s landmarks inside the face lie {self.slid:.1f} mm from the mesh's own (median)"
         if math.isnan(self.slid):
             slid = "without landmarks no figure says whether the mesh lies too far to a side on the skin"
         return (
-            f"median {self.median_distance:.3f} mm, 95th percentile {self.far_distance:.3f} mm from the scan, which "
-            f"shows {self.shown:.0%} of what faces outward{covered}; edges stretched by up to {self.stretch:.0%}; "
-            f"{slid}"
+            f"median {self.median_distance:.3f} mm, 95th percentile {self.far_distance:.3f} mm from {of}, which "
+            f"shows {self.shown:.0%} of the template's outer side{covered}; edges stretched by up to "
+            f"{self.stretch:.0%}; {slid}"
         )
 
     def verdict(self) -> str:

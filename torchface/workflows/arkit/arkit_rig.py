@@ -70,7 +70,7 @@ class ArkitRig:
             lines.append(f"its other shapes follow: {len(self.others)}")
         if self.carried is not None:
             record = self.carried.registration.record
-            lines.append(f"registered by {record.start}; {record.figures()}")
+            lines.append(f"registered by {record.start}; {record.figures('the head')}")
         return [*lines, *self.notes]
 
 
@@ -250,7 +250,7 @@ def _only_annotated(
     own = BlendshapeRig(head.whole, torch.stack(list(shapes.values())) / head.size, tuple(shapes))
     notes = annotations_on(own, on_face(template, registration), registration.pose)
     lines = [
-        f"landmarks and regions: registered by {registration.record.start}; {registration.record.figures()}",
+        f"landmarks and regions: registered by {registration.record.start}; {registration.record.figures('the head')}",
         *head.notes(),
     ]
     return replace(source.neutral, annotations=notes), lines, head.back(registration.pose)

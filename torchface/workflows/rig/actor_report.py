@@ -7,6 +7,9 @@ from torchface.modeling import ExampleRig, NormalMap
 from torchface.modeling.rigging.part_clearance import Penetration
 from torchface.registration import Registration
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import ARKIT, recognised_shapes
+
+_FEW = 8  # missing shapes of ARKit, up to which a template is one of them
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,6 +47,9 @@ class ActorReport:
         lines.append(f"rig: {len(self.rig.vertices)} vertices, {len(self.rig.names)} shapes transferred")
         if self.predicted:
             lines[-1] += f", {self.predicted} of them predicted by the model of expressions"
+        lacking = [name for name in ARKIT if name not in recognised_shapes(self.rig.names)]
+        if len(lacking) <= _FEW and lacking:
+            lines[-1] += f"; not of ARKit's 52: {', '.join(lacking)} (the template has no such shape)"
         lines += [f"  note: {self.transfer_summary}"] if self.transfer_summary else []
         lines += [] if self.penetration is None else [self.penetration.line()]
         if self.examples is not None:

@@ -14,6 +14,7 @@ from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io.gltf.character_scene import Block, Character
 from torchface.io.gltf.morph_insertion import AddedTargets
 from torchface.io.vrm.vrm_expressions import MorphBind
+from torchface.landmarks.surfaces.face_on_surface import MISFIT
 from torchface.modeling.rigging.carried_shapes import CarriedShapes
 from torchface.modeling.rigging.eyelid_closure import BLINKS
 from torchface.modeling.rigging.joined_vertices import joined_vertices
@@ -114,7 +115,8 @@ class CharacterJob:
         where = f"bone {character.head_bone!r} and " if character.head is not None else ""
         lines = [
             f"face: found by {where}{len(found.views)} views in {seconds[0]:.1f} s; presence {found.presence:.2f}, "
-            f"its landmarks lie {found.misfit:.0%} of the eyes' distance from a head's"
+            f"its landmarks lie {found.misfit:.0%} of the eyes' distance from a head's "
+            f"(at most {MISFIT:.0%} is taken for a face)"
         ]
         if len(found.others):
             lines.append(
@@ -128,8 +130,8 @@ class CharacterJob:
             )
         if (count := len(self.face.skin.faces)) < _COARSE:
             lines.append(f"  warning: its skin has {count:,} triangles, expected {_COARSE:,} for lids and lips to shut")
-        lines.append(f"template: {record.figures()}")
-        lines += [f"  note: {note}" for note in record.notes if not note.startswith(_OF_SCANS)]
+        lines.append(f"template: {record.figures('the head')}")
+        lines += [f"  note: {_of_the_head(note)}" for note in record.notes if not note.startswith(_OF_SCANS)]
         lines += [f"parts: {note}" for note in (() if self.parts is None else self.parts.notes)]
         if any(name in self.made for name in (*BLINKS, _JAW)):
             cut = self.parts is not None and self.parts.lips_cut
@@ -177,6 +179,11 @@ def _normal_changes(rest: Tensor, faces: Tensor, deltas: Tensor) -> Tensor:
     kept[joined.of] = torch.arange(len(joined.of))
     changes = torch.stack([vertex_normals(joined.vertices + one[kept], joined.faces) - before for one in deltas])
     return changes[:, joined.of]
+
+
+def _of_the_head(note: str) -> str:
+    """A note of a registration, in which the scan is a character's head: small parts of it still move."""
+    return note.replace("the scan", "the head").replace("were left out", "were left out of the fit alone")
 
 
 def _place(point: Tensor) -> str:

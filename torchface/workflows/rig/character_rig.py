@@ -238,7 +238,7 @@ def _landmarks_added(
     annotate_character(
         root, character, face.rows, annotations_on(own, on_face(template, registration), registration.pose)
     )
-    return f"landmarks and regions added; template: {registration.record.figures()}"
+    return f"landmarks and regions added; template: {registration.record.figures('the head')}"
 
 
 def _registered(template: BlendshapeRig, face: CharacterFace, path: Path, progress: Progress) -> Registration:
