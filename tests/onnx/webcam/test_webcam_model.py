@@ -107,12 +107,15 @@ def reader() -> FaceReader:
 
 @pytest.mark.bench
 def test_the_graph_is_the_module(reader: FaceReader, solver: AnswerSolver) -> None:
-    """Where a face is searched, followed, looked at once more and lost; networks that run twice are stored once."""
+    """Where a face is searched, followed, looked at once more and lost, and after a cut; networks that run twice are
+    stored once."""
     graph = WebcamGraph(reader, solver)
     model = webcam_model(reading_model(reader, solver.state_size), solving_model(solver))
     webcam, followed, generator = Webcam(model.SerializeToString()), 0, torch.Generator().manual_seed(3)
-    for size in ((90, 120), (90, 120), (90, 120), (200, 150), (200, 150), (64, 64), (64, 64)):
-        coarse = torch.rand(1, 4, 9, 12, generator=generator)
+    changes, sizes = [], ((90, 120), (90, 120), (90, 120), (200, 150), (200, 150), (64, 64), (64, 64))
+    drawn = [(size, torch.rand(1, 4, 9, 12, generator=generator)) for size in sizes]
+    film = [*drawn, *drawn[2:3] * 3, drawn[1], ((90, 120), torch.zeros(1, 4, 9, 12)), *drawn[1:3]]
+    for size, coarse in film:
         image = (255 * nn.functional.interpolate(coarse, size, mode="bilinear")[0]).byte().permute(1, 2, 0)
         before = torch.from_numpy(webcam.state)
         found = webcam.step(image.contiguous().numpy())
@@ -121,7 +124,9 @@ def test_the_graph_is_the_module(reader: FaceReader, solver: AnswerSolver) -> No
         for name, value in zip(OUTPUTS, expected, strict=True):
             np.testing.assert_allclose(found[name], value, atol=0.05, rtol=5e-3, err_msg=name)
         followed += int(expected[-1][8] > 0.5)
+        changes.append(float(expected[-1][STATE - 2]))
     assert followed > 2
+    assert (changes[9] < 0.01, changes[10] > 0.25) == (True, True)  # a cut comes
     names = {one.name for one in model.graph.initializer}
     assert sum(name.startswith("reader.landmarks.stem.0.0.weight") for name in names) == 1
     assert len(webcam.state) == STATE + 2

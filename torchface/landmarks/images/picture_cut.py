@@ -21,9 +21,9 @@ _CUT, _SUDDEN, _LEVELS, _SHARE = 0.25, 4.0, 5.0, 0.7
 def small_copy(image: Tensor) -> Tensor:
     """A small copy (3,PARTS,PARTS) of a picture (H,W,C), 3 channels or 4."""
     count = PARTS * _SAMPLES
-    places = torch.arange(count) + 0.5
+    places = torch.arange(count, device=image.device) + 0.5
     for axis in (0, 1):  # rows first: most pixels are gone when the columns' turn comes
-        size = torch.full((), image.shape[axis], dtype=torch.float32)
+        size = torch.full((), image.shape[axis], dtype=torch.float32, device=image.device)
         image = image.index_select(axis, (places * (size / count)).long())
     parts = image[..., :3].float().view(PARTS, _SAMPLES, PARTS, _SAMPLES, 3)
     return parts.mean((1, 3)).permute(2, 0, 1)

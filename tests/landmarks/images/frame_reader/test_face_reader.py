@@ -143,14 +143,14 @@ def test_it_stays_with_the_largest_and_finds_it_again(webcam: Webcam, portrait: 
     assert column(webcam.step(both(small, head))) > 190  # forgotten: the largest
 
 
+def patterns(count: int) -> Tensor:
+    """Coarse coloured patterns, uint8 (count,3,300,400)."""
+    colors = 255 * torch.rand(count, 3, 6, 8, generator=torch.Generator().manual_seed(0))
+    return interpolate(colors, size=(300, 400), mode="bicubic").clamp(0, 255).byte()
+
+
 def test_after_a_cut_the_face_is_found_at_once_elsewhere(webcam: Webcam, portrait: tuple[Tensor, Tensor]) -> None:
-    generator = torch.Generator().manual_seed(0)
-    walls = [
-        interpolate(255 * torch.rand(1, 3, 6, 8, generator=generator), size=(300, 400), mode="bicubic")[0]
-        .clamp(0, 255)
-        .byte()
-        for _ in range(2)
-    ]
+    walls = patterns(2)
 
     def shown(wall: int, left: int) -> Tensor:
         frame = walls[wall].clone()
@@ -161,6 +161,31 @@ def test_after_a_cut_the_face_is_found_at_once_elsewhere(webcam: Webcam, portrai
     after = webcam.step(shown(1, 240))
     assert column(after) == pytest.approx(column(first) + 230, abs=2)
     assert column(webcam.step(shown(1, 240))) == pytest.approx(column(after), abs=1)
+
+
+@pytest.mark.parametrize(
+    ("color", "frames"),
+    [((255, 255, 255), 1), ((0, 0, 0), 3), ((0, 0, 0), 15), ((190, 120, 100), 10), ((0, 200, 0), 1)],
+    ids=["flash", "black", "black for half a second", "hand", "glitch"],
+)
+def test_frames_without_a_picture_do_not_lead_to_a_larger_face(
+    webcam: Webcam, portrait: tuple[Tensor, Tensor], color: tuple[int, int, int], frames: int
+) -> None:
+    """A cut to a picture without a face, and back to the one before it."""
+    head = portrait[0]
+    small = interpolate(head[None].float(), (110, 110), mode="area")[0].byte()
+    film = []
+    for own, other in ((head, small), (small, head)):
+        frame = patterns(1)[0].clone()
+        frame[:, 80 : 80 + own.shape[1], 20 : 20 + own.shape[2]] = own
+        frame[:, 70 : 70 + other.shape[1], 230 : 230 + other.shape[2]] = other
+        film += [frame] * 4
+    assert all(column(webcam.step(frame)) < 190 for frame in film)
+    shade = torch.linspace(0.7, 1.0, 400)
+    odd = (torch.tensor(color)[:, None, None] * shade).byte().expand(3, 300, 400)
+    assert [float(webcam.step(odd).presence) for _ in range(frames)][-1] == 0
+    after = [column(webcam.step(film[-1])) for _ in range(15)]
+    assert max(after) < 190
 
 
 def test_a_face_with_too_few_visible_landmarks_to_be_solved_is_none(

@@ -36,13 +36,15 @@ from torchface.landmarks.images.person_identity import (
     is_beside,
     is_other,
     known_look,
+    look_alone,
 )
 from torchface.landmarks.images.picture_cut import PARTS, cut_between, small_copy
 from torchface.shape_names import ARKIT
 
 _PLACED = 16
 _SEEN = _PLACED + IDENTITY
-STATE = _SEEN + 3 * PARTS**2 + 1
+_COPY = 3 * PARTS**2
+STATE = _SEEN + 2 * _COPY + 2
 """Numbers that a reader hands on."""
 
 _FAR, _LOOSE = 0.75, 0.25  # shared share of two places
@@ -113,18 +115,24 @@ class FaceReader(nn.Module):
         place, anchor, size = state[:5], state[5:8], picture_size(image)
         following, missing, doubt, since, attempt, covered = state[8:14].unbind()
         same = (size == state[14:_PLACED]).all()
-        # Another picture size is another camera: its face may be anywhere. So may that of another picture after a cut.
+        # Another picture size is another camera: its face may be anywhere. So may that of another picture after a cut,
+        # until the picture with the face comes back: it may have been a flash, a hand, a faulty frame.
         picture = small_copy(image)
-        cut, change = cut_between(state[_SEEN:-1].view(3, PARTS, PARTS), picture, state[-1])
-        cut = cut & same
-        missing = torch.where(cut, _PATIENCE, missing)
-        place, people = place * same, state[_PLACED:_SEEN] * (same & ~cut)
+        *copies, change, away = state[_SEEN:].split([_COPY, _COPY, 1, 1])
+        last, showing = (one.view(3, PARTS, PARTS) for one in copies)
+        cut, change = cut_between(last, picture, change[0])
+        away = ((away[0] > 0.5) | cut) & same
+        another, _ = cut_between(showing, picture, torch.zeros(()))
+        missing = torch.where(away & ~another, 0.0, missing)
+        away = away & another
+        cut = cut & away
+        place, people = place * same, state[_PLACED:_SEEN] * same
         known = (following > 0.5) & same
         late = known & ((interval > _LONGEST) | cut)
         followed = known & ~late
-        crowded = is_beside(people)
+        crowded = is_beside(people) & ~away
         hidden = crowded & is_awaited(people)
-        waiting = hidden | (~crowded & (missing < _PATIENCE))
+        waiting = hidden | (~crowded & ~away & (missing < _PATIENCE))
         doubted = followed & (doubt >= _DOUBT)
         lost_now = ~followed & ((missing <= _EAGER) | (since >= _PAUSE) | hidden)
         pause = torch.where(covered > 0.5, _COVERED, _COUNTED)
@@ -142,7 +150,8 @@ class FaceReader(nn.Module):
         there, confirmed = found[5] > 0.5, found[6] > 0.5
         # After a long while too it is where it was, if it is seen there, or nowhere.
         followed, asked = followed | (late & ((confirmed & ~cut) | ~there)), asked | late
-        people = after_boxes(people, found[7:].view(CANDIDATES, 4), searched, interval)
+        people = after_boxes(people, found[7:].view(CANDIDATES, 4), searched & ~away, interval)
+        expected = torch.where(away, look_alone(people), people)
         begin = torch.where(followed, sought(place, anchor), found[:5])
         ready = plausible(begin, size, settings.smallest) & (followed | there)
         first = torch.where(ready, begin, torch.tensor(_ANYWHERE))
@@ -172,7 +181,7 @@ class FaceReader(nn.Module):
             lambda image, around, known: known.clone(),
             (image, around, known_look(people)),
         )
-        stranger = is_other(people, own, appearance, interval)
+        stranger = is_other(expected, own, appearance, interval)
         vague = confidence_of(deviation / own[2].clamp(min=1)).mean() < settings.vague
         kept = ((presence >= settings.likely) & ~vague) | ~asked | confirmed
         kept = kept & (presence >= settings.least) & (growth > _SHRUNK) & (growth < _GROWN)
@@ -191,10 +200,12 @@ class FaceReader(nn.Module):
             (looked.visibility.amin(0) < _HIDDEN).float(),
         ]
         anchor = torch.where(good & ~followed, relation(own, shown), anchor)
+        people = torch.where(good, expected, people)
         people = after_face(people, own, appearance, (good, stranger & (followed | there)), interval)
-        own = torch.where(good, own, place * ~cut)
-        shown_last = [size, people, picture.flatten(), change[None]]
-        after = torch.cat([own, anchor, torch.stack(counts), *shown_last])
+        own = torch.where(good, own, place)
+        pictures = [picture.flatten(), torch.where(good, picture, showing).flatten()]
+        changes = torch.stack([change, (away & ~good).float()])
+        after = torch.cat([own, anchor, torch.stack(counts), size, people, *pictures, changes])
         face = read_eyes(image, looked, self.eyes)
         nothing = dict.fromkeys(("landmarks", "iris", "openness", "closed", "expression"), torch.nan)
         nothing |= dict.fromkeys(("visibility", "presence", "eye_visibility"), 0.0)
