@@ -308,16 +308,17 @@ def test_attach_finds_the_sites_and_draws_them(
 def test_attach_takes_out_slip_and_swaps_and_writes_what_no_rig_explains_only_as_insisted(
     shoot: Path, dome_rig: BlendshapeRig, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    true, out = place_markers(dome_rig, 30), shoot / "sites.json"
+    true, out = place_markers(dome_rig, 20), shoot / "sites.json"
     weights = 0.5 + 0.5 * torch.sin(torch.arange(150)[:, None] * torch.tensor([0.08, 0.17, 0.25, 0.35]))
     slip = StageFlaws(noise=0.05, slip_translation=8, slip_rotation=3)
     markers = record(dome_rig, true, weights, torch.Generator().manual_seed(0), slip).take.markers
     values = markers.values.clone()
-    values[60:90, [3, 20]] = markers.values[60:90, [20, 3]]
+    values[60:90, [3, 17]] = markers.values[60:90, [17, 3]]
     values[:, 5] = torch.tensor([0.0, 40.0, 120.0]) + 30 * torch.sin(torch.arange(150)[:, None] / 9)
     save_take(Take(60.0, markers=Track(markers.names, values)), shoot / "dirty.c3d")
     misplaced(dome_rig, true, torch.Generator().manual_seed(1), 2.0, 5.0).save(shoot / "guess.json")
-    words = ("attach", shoot / "rig.glb", shoot / "dirty.c3d", "--initial", shoot / "guess.json", "--out", out, "-q")
+    words = ("attach", shoot / "rig.glb", shoot / "dirty.c3d", "--initial", shoot / "guess.json", "--out", out)
+    words = (*words, "--scale", "free", "--quiet")  # held, it would also be tried off the skin, which takes as long
     with pytest.raises(SystemExit):
         run(*words)
     assert re.search(r"dirty.c3d: markers: M006 .*--insist", " ".join(capsys.readouterr().err.split()))
