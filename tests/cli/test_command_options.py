@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
 import pytest
+import torch
 import tyro
 from tyro.conf import arg
 
+from torchface import BlendshapeRig, Take, Track, save_animation, save_rig
 from torchface.cli import COMMANDS, GROUPS, main
 from torchface.cli.command_options import Output, checked, placed
 from torchface.cli.export import export_model
@@ -143,6 +145,19 @@ def test_o_is_short_for_out(tmp_path: Path) -> None:
     save_mesh(neutral_head(texture=False), tmp_path / "head.obj")
     main(["render", str(tmp_path / "head.obj"), "-o", str(tmp_path / "head.png"), "--height", "64", "--yaw", "0"])
     assert (tmp_path / "head.png").is_file()
+
+
+def test_a_file_with_an_animation_that_is_rendered_at_rest_names_the_way_to_a_frame(
+    dome_rig: BlendshapeRig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    take = Take(30.0, weights=Track(dome_rig.names[:1], torch.linspace(0, 1, 5)[:, None, None]))
+    save_animation(dome_rig, take, tmp_path / "take.glb")
+    save_rig(dome_rig, tmp_path / "rig.glb")
+    small = ("--height", "64", "--yaw", "0", "--quiet")
+    for name, more, said in (("rig", (), False), ("take", (), True), ("take", ("--take", "take.glb"), False)):
+        more = tuple(str(tmp_path / word) if word.endswith(".glb") else word for word in more)
+        main(["render", str(tmp_path / f"{name}.glb"), "--out", str(tmp_path / "a.png"), *small, *more])
+        assert ("is shown at rest" in " ".join(capsys.readouterr().err.split())) == said
 
 
 def test_a_frame_without_a_take_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

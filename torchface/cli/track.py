@@ -75,7 +75,9 @@ def track(
             Landmarker bundle (.task); or a .csv that holds them, ours, OpenFace's, py-feat's or MediaPipe's mesh, then
             VIDEO may be left out.
         appearance: Model of the actor's own looks that refines them.
-        prior: What weights faces have, for names of shapes that the rig has too, or none; see `torchface train priors`.
+        prior: What weights faces have, by a shape prior's name or folder, see `torchface train priors`, or none. With
+            the default, what the landmark network reads of expressions takes its place; `shape_prior` itself is for
+            landmarks from what reads none.
         dynamics: A dynamics prior, the motion of weights from frame to frame, at any frame rate.
         offsets: Fixed offsets between the rig's landmarks and those found, as an earlier take wrote them; those in OUT,
             or estimated with the take, if absent.

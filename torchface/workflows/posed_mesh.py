@@ -1,15 +1,17 @@
 """A mesh or a posed rig from whatever file it lies in."""
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import torch
 from torch import Tensor
 
-from torchface.errors import NameMismatchError, NoShapesError, ValueRangeError
+from torchface.errors import NameMismatchError, NoShapesError, TorchfaceError, ValueRangeError
 from torchface.io import load_mesh, load_rig
 from torchface.io.mesh_files import MESH_ENDINGS
+from torchface.io.rig_files import SCENE_ENDINGS, load_animation
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import Mesh, submesh
 from torchface.rig import BlendshapeRig
@@ -66,6 +68,13 @@ def load_posed(
         raise ValueRangeError(f"{take}: found {len(track)} frames, expected frame {frame} among them")
     row = rig.weights_from(track.frames(slice(frame, frame + 1)))[0]
     return Posed(rig.neutral.with_vertices(rig(row[None].to(rig.deltas))[0]), rig.neutral)
+
+
+def is_animated(path: Path) -> bool:
+    """Whether a file has an animation of its shapes."""
+    with suppress(TorchfaceError):  # what is wrong with an animation is no matter of a mesh at rest
+        return path.suffix.lower() in SCENE_ENDINGS and load_animation(path) is not None
+    return False
 
 
 def pose_row(rig: BlendshapeRig, weights: Mapping[str, float], option: str = "--weights") -> Tensor:

@@ -205,13 +205,16 @@ def test_the_first_start_solves_by_pytorch_until_its_graph_is_made(
     solver, picture = live_anybody.person_solver(silent), np.zeros((64, 64, 3), np.uint8)
     frames = [solver.step(picture, None, WebcamControls())]
     assert frames[0].calibrated == 0
+    assert solver.reader.startswith("the graph was not ready by the last frame")
     until = time.monotonic() + 60
     while not frames[-1].calibrated and time.monotonic() < until:
         time.sleep(0.01)
         frames.append(solver.step(picture, 0.01, WebcamControls()))
     assert frames[-1].calibrated == 1
+    assert solver.reader.startswith("the graph is made")
     assert [float(frame.weights[0]) for frame in frames] == list(range(1, len(frames) + 1))  # nothing is begun anew
     begun = live_anybody.person_solver(silent)  # the second start
+    assert begun.reader == ""
     assert begun.step(picture, None, WebcamControls()).calibrated == 1
 
 

@@ -61,12 +61,17 @@ prepared_webcam_graph()
 """
 
 
-class PersonSolver:
-    """Solves frames for ARKit's weights; ``better`` gives once a session to go on with, else None."""
+_UNMADE = "the graph was not ready by the last frame: PyTorch read all faces; the next start takes what is made of it"
+_MADE = "the graph is made: it read the last faces, and reads all from the next start on"
 
-    def __init__(self, session: WebcamSession, better: Callable[[], WebcamSession | None] = lambda: None) -> None:
+
+class PersonSolver:
+    """Solves frames for ARKit's weights; ``better`` gives once a session to go on with, else None. ``reader`` says what
+    has become of it."""
+
+    def __init__(self, session: WebcamSession, better: Callable[[], WebcamSession | None] | None = None) -> None:
         self._session, self._better = session, better
-        self._ever = False
+        self._ever, self.reader = False, "" if better is None else _UNMADE
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -75,9 +80,9 @@ class PersonSolver:
 
     def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
         """Solves the next frame; see :class:`torchface.workflows.live.live_frames.FaceSolver`."""
-        if (better := self._better()) is not None:
+        if self._better is not None and (better := self._better()) is not None:
             better.resume(self._session.state)
-            self._session = better
+            self._session, self.reader = better, _MADE
         self._session.controls = controls
         answer = self._session.step(picture, _USUAL if interval is None else interval)
         solved = LiveFrame(
@@ -243,7 +248,9 @@ def go_live(
         wrong = received.receiver.counts.words() if received is not None else ""
         more = (wrong, *(take.note for take in saved), *streams.notes())
         silence = "" if received is None else received.silence
-        return LiveReport(session.figures, source.dropped, tuple(note for note in more if note), silence), saved
+        said = tuple(note for note in more if note)
+        reader = solver.reader if isinstance(solver, PersonSolver) else ""
+        return LiveReport(session.figures, source.dropped, said, silence, bool(settings.addresses), reader), saved
 
 
 def _keep_dropped(preparing: Preparing, recordings: Recordings, say: Say) -> None:

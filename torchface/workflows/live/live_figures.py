@@ -62,6 +62,8 @@ class LiveReport:
     dropped: int  # frames that came while another was solved
     notes: tuple[str, ...] = ()  # what the user should know, such as receivers that were not there
     silence: str = ""  # that no face has come, where an address was listened at
+    sent: bool = True  # whether weights were sent to an address
+    reader: str = ""  # what has become of the graph that a first start makes
 
     def lines(self) -> list[str]:
         """For people to read."""
@@ -69,12 +71,14 @@ class LiveReport:
         warnings = [f"warning: {note}" for note in self.notes]
         if self.silence:
             return [f"in {figures.seconds:.1f} s {self.silence}", *warnings]
+        end = "packet" if self.sent else "weights"
         none = figures.frames > 0 and figures.found == 0
         return [
             f"{figures.frames} frames solved in {figures.seconds:.1f} s, a face in {figures.found}; they came at "
             f"{figures.fps:.1f} a second",
-            f"{figures.latency(0.5):.1f} ms from frame to packet (99th percentile {figures.latency(0.99):.1f} ms), "
+            f"{figures.latency(0.5):.1f} ms from frame to {end} (99th percentile {figures.latency(0.99):.1f} ms), "
             f"{self.dropped} frames were dropped, as they came while another was solved",
+            *([self.reader] if self.reader else []),
             *(["warning: no face was found, so nothing has moved: weights and head stayed at rest"] if none else []),
             *warnings,
         ]

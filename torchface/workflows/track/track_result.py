@@ -187,11 +187,11 @@ class Tracked:
         fit = f"the solved face lies {100 * misfit:.1f} % of the eyes' distance from the landmarks"
         if misfit > _POOR:
             whose = (
-                "is the rig this person's own"
+                "is the rig this person's own? If not: track without --rig, then torchface retarget"
                 if self.head is None
-                else "does --rig with their own, or a model of people, do better"
+                else "does --rig with their own, or a model of people, do better?"
             )
-            return f"result: poor, {fit} (at most {100 * _POOR:.3g} % is usual; {whose}?); {found}"
+            return f"result: poor, {fit} (at most {100 * _POOR:.3g} % is usual; {whose}); {found}"
         if seen < _MOST * count:
             return f"result: partly usable, {found}; there {fit} (at most {100 * _POOR:.3g} % is usual)"
         return f"result: good, {found}, and {fit} (at most {100 * _POOR:.3g} % is usual)"
@@ -282,10 +282,13 @@ class Tracked:
         often = [i for i in bounds.argsort(descending=True).tolist() if bounds[i] > _OFTEN]
         if often:
             named = ", ".join(f"{self.rig.names[i]} {100 * float(bounds[i]):.0f} %" for i in often[:_MAX_NAMED])
+            more = "a rig made by torchface fit with a photograph of this expression among others goes further"
+            if self.head is None:
+                why = f"the rig; {more}. If the rig is another person's: track without --rig, then torchface retarget"
+            else:
+                why = f"the head that was solved with the take; {more}: --rig takes it"
             lines.append(
-                f"often at their maximum, 1: {named} of the frames; the face goes further than these shapes of the "
-                "rig, or the rig is not this person's; a photograph of this expression in torchface fit shows the rig "
-                "more"
+                f"often at their maximum, 1: {named} of the frames; the face goes further than these shapes of {why}"
             )
         if unlearned := self.inputs.models.unlearned:
             more = f" and {len(unlearned) - _MAX_NAMED} more" if len(unlearned) > _MAX_NAMED else ""

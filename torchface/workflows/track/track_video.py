@@ -79,7 +79,7 @@ def track_video(
     """
     progress = progress or silent
     with within_job(out):
-        progress("reading the models")
+        progress("reading the models; the first run makes their graphs, once")
         inputs, others = other_cameras(load_inputs(video, rig, settings or TrackSettings()))
         return _track(inputs, others, out, video is not None, progress)
 
