@@ -86,6 +86,15 @@ def test_a_rate_is_that_of_frames_while_they_come(fps: float, jitter: float, tog
     np.testing.assert_array_equal(found.seconds.numpy(), times)
 
 
+@pytest.mark.parametrize("fps", [24.0, 30000 / 1001, 60.0])
+@pytest.mark.parametrize("delay", [0.002, 0.004, 0.008])
+def test_delays_do_not_change_a_rate(fps: float, delay: float) -> None:
+    generator = np.random.default_rng(2)
+    for _ in range(5):
+        times = np.maximum.accumulate(np.arange(1200) / fps + generator.exponential(delay, 1200))
+        assert typical_rate(np.diff(times)) == pytest.approx(fps, rel=3e-4)
+
+
 @pytest.mark.parametrize("jitter", [0.001, 0.008, 0.015])
 def test_what_a_network_held_back_is_no_pause(jitter: float) -> None:
     times = of_frames(1200, 60.0, jitter)
@@ -104,11 +113,20 @@ def test_what_a_network_held_back_is_no_pause(jitter: float) -> None:
         ([0.033, 0.05] * 50, 1 / 0.0415),  # no step of 40 ms among them
         (([1 / 60] * 4 + [2 / 60]) * 60, 60.0),  # one in six was lost
         ([5e-4, 2 / 60 - 5e-4, 2 / 60, 2 / 60, 2 / 60] * 60, 5 / (8 / 60)),  # pairs of which many lost one
+        ([5e-4] * 7 + [8 / 30 - 35e-4], 30.0),  # few frames, eight at once
         ([1 / 30] * 200 + [1 / 15] * 50, 30.0),  # in the dark a camera takes half as many
     ],
 )
 def test_the_typical_rate_of_few_or_uneven_steps(steps: list[float], fps: float) -> None:
     assert typical_rate(np.array(steps)) == pytest.approx(fps)
+
+
+@pytest.mark.parametrize("together", [4, 6, 8])
+def test_few_frames_that_come_at_once_have_no_rate_of_thousands(together: int) -> None:
+    for count in range(2 * together, 5 * together, together):
+        times = of_frames(count, 30.0, together=together)
+        assert typical_rate(np.diff(times)) < 60
+        assert typical_rate(np.diff(times[: 1 - together])) < 60
 
 
 def test_a_long_gap_makes_no_milliseconds() -> None:
@@ -119,6 +137,11 @@ def test_a_long_gap_makes_no_milliseconds() -> None:
 def test_a_format_in_seconds_may_have_keys_far_apart() -> None:
     found = key_times(np.array([0, 4, 8, 20], np.float32), file_error("take.glb"))
     assert found.seconds.tolist() == [0, 4, 8, 20]
+
+
+def test_frames_may_be_minutes_apart() -> None:
+    for times in ([0, 120, 250], [0, 150]):
+        assert key_times(np.array(times, np.float32), file_error("take.glb")).seconds.tolist() == times
 
 
 def test_times_that_repeat_by_rounding_alone_are_even() -> None:

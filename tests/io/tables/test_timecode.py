@@ -51,6 +51,21 @@ def test_frames_keep_their_times_where_others_were_dropped(fps: float, steps: li
         assert timing.seconds is None
 
 
+@pytest.mark.parametrize("share", [0.1, 0.4])
+@pytest.mark.parametrize("digits", [0, 3])
+def test_lost_frames_do_not_change_a_rate(share: float, digits: int) -> None:
+    generator = torch.Generator().manual_seed(3)
+    early = 0.1 * torch.rand(400, generator=generator) if digits else torch.zeros(400)
+    kept = torch.rand(400, generator=generator) > share
+    ticks = [(i, part) for i, part, keep in zip(range(400), early.tolist(), kept.tolist(), strict=True) if keep]
+    codes = [f"00:00:{i // 30:02d}:{i % 30 + part:0{digits + 3 if digits else 2}.{digits}f}" for i, part in ticks]
+    assert read_timecodes(codes, _PATH).fps == 30
+
+
+def test_a_timecode_that_comes_twice_does_not_double_the_rate() -> None:
+    assert read_timecodes(["00:00:00:05", "00:00:00:05", "00:00:00:06"], _PATH).fps == 60
+
+
 def test_midnight_is_no_gap() -> None:
     codes = [f"23:59:59:{frame:02d}" for frame in range(20, 25)] + [f"00:00:00:{frame:02d}" for frame in range(10)]
     timing = read_timecodes(codes, _PATH)

@@ -144,6 +144,19 @@ def test_a_clock_that_does_not_go_as_this_machines_is_not_used(sent: np.ndarray,
     np.testing.assert_allclose(seconds, came - came[0], atol=1e-5)  # of timecodes
 
 
+@pytest.mark.parametrize("rate", [29.95, 30.04, 24.03])
+def test_ten_minutes_of_a_camera_of_another_rate_are_not_stretched(rate: float) -> None:
+    came = np.arange(int(600 * rate)) / rate
+    fps, seconds = the_times(np.full(len(came), np.nan), came)
+    assert seconds is None
+    assert fps == pytest.approx(rate, rel=1e-6)
+
+
+def test_frames_that_are_minutes_apart_keep_their_times() -> None:
+    _, seconds = the_times(np.full(3, np.nan), np.array([0, 120.0, 250.0]))
+    assert seconds.tolist() == [0, 120, 250]
+
+
 @pytest.mark.parametrize("came", [[0.0], [0.0] * 5, [0.0, 1e-6, 2e-6], [0.0, 300.0], [0.0, 0.1, 0.1, 0.05, 0.2]])
 def test_no_take_is_lost_by_its_times(came: list[float], dome: Path, tmp_path: Path) -> None:
     takes, _, _ = recorded(np.array(came), dome, tmp_path / "out")

@@ -33,9 +33,11 @@ _UNITS = ("milliseconds", "microseconds", "nanoseconds")
 PAUSE = 8.0  # a step so many times the usual one is a pause
 _CLOSE, _EVENLY = 0.25, 0.59  # so near is a step to the middle one, and so many are it, where frames come one by one
 _ROUNDS = 3  # of averaging what is near the middle step; that one alone is rounded differently by each file
-_MISSED = 2.5  # steps of so many frames may be of lost ones
 _GRID = 4.0  # times the typical rate; a grid of a higher one is not that of lost frames: some came at once
 _TOGETHER = 8  # frames that a network may deliver at once
+_EDGE = 64  # frames at either end of which the one counts that was delayed least
+_AT_ONCE = 0.002  # seconds: frames that are so near came at once
+_ALL, _SEEN = 0.9, 3  # share of steps that are of whole frames; frames beside a gap that show how many were lost
 
 
 def simplest_rate(rate: float, agrees: Callable[[float], bool]) -> float:
@@ -66,22 +68,52 @@ def typical_rate(steps: np.ndarray) -> float:
     """
     count, times = len(steps), np.concatenate([[0.0], np.cumsum(steps)])
     window = min(_TOGETHER, count // 4) if count >= _TOGETHER else min(2, max(1, count - 1))
-    usual = _middle(times[window:] - times[:-window]) / window or float(steps.mean())
+    usual = _middle(times[window:] - times[:-window]) / window
+    if usual == 0 or (usual < _AT_ONCE and window < _TOGETHER):  # too few to see how many a network delivers at once
+        usual = float(steps.mean())
     middle = _middle(steps)
     for _ in range(_ROUNDS if middle > 0 else 0):
         near = _up_to(_CLOSE * middle, np.abs(steps - middle))
         middle = float((near @ steps) / near.sum())
-    one_by_one = usual / 2 < middle < usual * (1 + _CLOSE) and near.mean() >= _EVENLY
-    # How many frames each step is of, gradually from one number to the next: files round times differently.
-    whole, part = np.divmod(steps / middle, 1) if one_by_one else (np.ones(count), 0.0)
-    frames = whole + np.clip((part - 0.4) / 0.2, 0, 1)
-    counted = _up_to(_MISSED * middle if one_by_one else PAUSE * usual, steps)
-    if not one_by_one:  # after a pause nothing is made up for; what a network held back comes at once
-        ends = np.minimum(np.arange(count) + np.maximum(steps / usual, 1), count).astype(int)
-        spans = (times[ends] - times[:-1]) / (ends - np.arange(count))
-        counted = np.maximum(counted, np.clip(4 - 2.5 * spans / usual, 0, 1))
-    lasting = float(counted @ steps)
-    return float(counted @ frames) / lasting if lasting > 0 else count / float(steps.sum())
+    one_by_one = usual / 2 < middle < usual * (1 + _CLOSE)
+    if one_by_one and near.mean() < _EVENLY:
+        whole = np.maximum(np.rint(steps / middle), 1) * middle
+        one_by_one = bool((np.abs(steps - whole) < _LIKE * middle).mean() > _ALL)
+    period = middle if one_by_one else usual
+    for _ in range(_ROUNDS):
+        frames, lasting = _in_pieces(times, period, one_by_one)
+        if not lasting / 2 < frames * period < 2 * lasting:
+            break
+        period = lasting / frames
+    return 1 / period
+
+
+def _in_pieces(times: np.ndarray, period: float, one_by_one: bool) -> tuple[float, float]:
+    """How many frames there were between breaks, and for how many seconds, where they come about ``period`` apart.
+
+    After a break all frames are later than those before it were; what a network held back is followed by frames that
+    are not. Lost ones are counted where frames come ``one_by_one``.
+    """
+    steps, late = np.diff(times), times - period * np.arange(len(times))
+    lost, starts, done, gone = np.zeros(len(times)), [0], 0, 0.0
+    for row in np.flatnonzero(steps > 1.5 * period).tolist():
+        late[done : row + 1] -= gone
+        done = row + 1
+        held = _TOGETHER + min(len(times), int(steps[row] / period))
+        behind, ahead = late[max(starts[-1], done - _TOGETHER) : done], late[done : done + held] - gone
+        missed = float(ahead.min() - behind.min()) / period
+        if missed > (PAUSE - 1 if not one_by_one or min(len(ahead), len(behind)) >= _SEEN else 0.5):
+            starts.append(done)
+        elif one_by_one:
+            lost[done], gone = round(missed), gone + round(missed) * period
+    numbers = np.arange(len(times)) + np.cumsum(lost)
+    late, frames, lasting = times - period * numbers, 0.0, 0.0
+    for start, end in zip(starts, [*starts[1:], len(times)], strict=True):
+        edge = max(1, min(_EDGE, (end - start) // 4))
+        first = start + int(late[start : start + edge].argmin())
+        last = end - edge + int(late[end - edge : end].argmin())
+        frames, lasting = frames + float(numbers[last] - numbers[first]), lasting + float(times[last] - times[first])
+    return frames, lasting
 
 
 def _up_to(limit: float, values: np.ndarray) -> np.ndarray:
@@ -157,8 +189,10 @@ def frame_times(times: np.ndarray, source: TimeSource) -> FrameTimes:
         count, duration = float(numbers[-1] - numbers[0]), float(times[-1] - times[0])
         place = (numbers - numbers[0]) / count
         if np.abs(times - times[0] - place * duration).max() <= _UNEVEN * duration / count + resolution:
-            rate = _checked(_rate(count, duration, resolution, source.rate), source)
-            even = count == len(times) - 1
+            rate = _rate(count, duration, resolution, source.rate)
+            if rate < MIN_FPS:
+                return FrameTimes(MIN_FPS, torch.from_numpy(times))
+            rate, even = _checked(rate, source), count == len(times) - 1
             return FrameTimes(rate, None if even else torch.from_numpy(times[0] + (numbers - numbers[0]) / rate))
     if repeated:  # more than by rounding
         row = int(np.flatnonzero(np.diff(times) == 0)[0])
@@ -169,7 +203,8 @@ def frame_times(times: np.ndarray, source: TimeSource) -> FrameTimes:
     steps = np.diff(times)
     if source.rate is not None and np.abs(steps * source.rate - 1).min() <= _LIKE:
         return FrameTimes(source.rate, torch.from_numpy(times))
-    return FrameTimes(_checked(common_rate(typical_rate(steps)), source), torch.from_numpy(times))
+    rate = max(MIN_FPS, common_rate(typical_rate(steps)))
+    return FrameTimes(_checked(rate, source), torch.from_numpy(times))
 
 
 def key_times(times: np.ndarray, error: Callable[[str, str], FileFormatError], rate: float | None = None) -> FrameTimes:

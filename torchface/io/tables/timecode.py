@@ -12,7 +12,7 @@ from torch import Tensor
 from torchface.errors import FileFormatError
 from torchface.io.tables.csv_table import quoted
 from torchface.io.tables.frame_rates import TimeSource, common_rate, file_error, frame_times, typical_rate
-from torchface.number_checks import check_rate
+from torchface.number_checks import MIN_FPS, check_rate
 
 _PATTERN = re.compile(r"([0-9]{1,2}):([0-9]{1,2}):([0-9]{1,2})([:;])([0-9]{1,3}(?:\.[0-9]{1,9})?)")
 _DAY = 24 * 3600
@@ -70,8 +70,8 @@ def read_timecodes(texts: Sequence[str], path: Path) -> Timing:
             f"{path}: found the timecode {texts[row + 1]} in frame {row + 2} after {texts[row]}, expected a clock that "
             "goes on: sort the rows by time, or cut the take there"
         )
-    measured = typical_rate(steps / rate_of_base)
-    fps = check_rate(common_rate(measured), f"{path}: timecodes")
+    measured = typical_rate(steps[steps > 0] / rate_of_base)  # frames of one timecode came between two of its clock
+    fps = check_rate(max(MIN_FPS, common_rate(measured)), f"{path}: timecodes")
     since = np.concatenate([[0.0], np.cumsum(steps)]) / rate_of_base
     source = TimeSource(file_error(path), rate=fps, resolution=_digits(texts) / rate_of_base, seconds=True)
     found = frame_times(since, source)

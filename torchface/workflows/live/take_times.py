@@ -1,5 +1,7 @@
 """When the frames of a take that was performed live are shown."""
 
+from dataclasses import replace
+
 import numpy as np
 from torch import Tensor
 
@@ -11,6 +13,7 @@ _TICK = 1 / 60_000  # seconds, which timecodes count
 _SPACED, _SLOWEST = 1.25 * PAUSE, 5.0  # steps, but not more seconds, between frames kept of a time when nobody sends
 _HELD, _RELAXED = 0.5, 4.0  # seconds in which nobody sends: nothing moves before and after; networks pause for less
 _OFF, _SHARE, _DRIFT = 0.1, 0.25, 2e-4  # of clocks: seconds, but not more of a take; seconds a second
+_DRIFTED = 0.25  # of a frame
 _OWN_RATE = 1e-4  # by which a rate may differ from the source's stated one
 
 
@@ -41,11 +44,15 @@ def take_times(
     rate = typical_rate(np.diff(_rising(times[came])))
     kept = _with_pauses(times, fresh, min(_SPACED / rate, _SLOWEST))
     times = np.rint(_rising(times[kept]) / _TICK) * _TICK
-    rate = typical_rate(np.diff(times))
-    if not MIN_FPS <= rate <= MAX_FPS:
+    rate = max(MIN_FPS, typical_rate(np.diff(times)))
+    if rate > MAX_FPS:
         return came, stated, None
     rate = stated if abs(rate / stated - 1) <= _OWN_RATE else common_rate(rate)
-    found = frame_times(times, TimeSource(file_error("recording"), rate=rate, resolution=_TICK, seconds=True))
+    source = TimeSource(file_error("recording"), rate=rate, resolution=_TICK, seconds=True)
+    found = frame_times(times, source)
+    end = (len(times) - 1) / found.fps if found.seconds is None else float(found.seconds[-1])
+    if abs(end - times[-1]) > _DRIFTED / rate:  # a common rate that is not the camera's
+        found = frame_times(times, replace(source, rate=None))
     return kept, found.fps, found.seconds
 
 
