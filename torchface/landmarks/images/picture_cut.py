@@ -32,6 +32,12 @@ def small_copy(image: Tensor) -> Tensor:
 def cut_between(before: Tensor, after: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
     """Whether a cut lies between two pictures, small copies of one size, () bool, and by how much they differ, ();
     ``change`` is by how much the earlier one differed from that before it."""
-    now = 1 - face_look(after) @ face_look(before)
+    sudden, now = sudden_change(before, after, change)
     share = ((after - before).square().mean(0).sqrt() > _LEVELS).float().mean()
-    return (now > (_SUDDEN * change).clamp(min=_CUT)) & (share > _SHARE), now
+    return sudden & (share > _SHARE), now
+
+
+def sudden_change(before: Tensor, after: Tensor, change: Tensor) -> tuple[Tensor, Tensor]:
+    """As :func:`cut_between`, where a plain background may stay as it is."""
+    now = 1 - face_look(after) @ face_look(before)
+    return now > (_SUDDEN * change).clamp(min=_CUT), now

@@ -9,7 +9,7 @@ from torchface.errors import ShapeError
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop
 from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.person_identity import IDENTITY, LOOK_MARGIN, face_look, look_alone
-from torchface.landmarks.images.picture_cut import PARTS, cut_between, small_copy
+from torchface.landmarks.images.picture_cut import PARTS, small_copy, sudden_change
 
 _SIZE = 20  # pixels of the crop that a look is read from
 _LOOK = 3 * _SIZE * _SIZE
@@ -79,7 +79,7 @@ class FollowedFace:
         """Notes how a frame (H,W) or (3,H,W) looks, and whether a cut lies before it."""
         picture = small_copy(image.expand(3, -1, -1).permute(1, 2, 0))
         if self.picture is not None:
-            cut, change = cut_between(self.picture, picture, torch.tensor(self.change))
+            cut, change = sudden_change(self.picture, picture, torch.tensor(self.change))
             self.cut, self.change = self.cut or bool(cut), float(change)
         self.picture = picture
 
