@@ -76,8 +76,8 @@ def track(
             VIDEO may be left out.
         appearance: Model of the actor's own looks that refines them.
         prior: What weights faces have, by a shape prior's name or folder, see `torchface train priors`, or none. With
-            the default, what the landmark network reads of expressions takes its place; `shape_prior` itself is for
-            landmarks from what reads none.
+            the default a landmark network that reads expressions uses its own mean and covariance of the weights;
+            `shape_prior` is used with landmarks from anything else.
         dynamics: A dynamics prior, the motion of weights from frame to frame, at any frame rate.
         offsets: Fixed offsets between the rig's landmarks and those found, as an earlier take wrote them; those in OUT,
             or estimated with the take, if absent.

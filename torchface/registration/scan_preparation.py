@@ -89,7 +89,10 @@ def prepare_scan(scan: Mesh, template: Mesh) -> PreparedScan:
     if crumbs:
         lost = int((solid & ~large[label]).sum())
         share = float(area_of[~large].sum() / area_of.sum())
-        notes.append(f"{crumbs} loose parts of the scan ({lost} triangles, {share:.1%} of its area) were left out")
+        notes.append(
+            f"{crumbs} loose parts of the scan ({lost} triangles, {share:.1%} of its area) were left out: such are "
+            "dust, teeth, eyes"
+        )
     face_ids = keep.nonzero()[:, 0]
     used, faces = faces[face_ids].unique(return_inverse=True)
     prepared = PreparedScan(vertices[used], faces, face_ids, tuple(notes))

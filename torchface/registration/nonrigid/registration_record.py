@@ -56,7 +56,7 @@ class RegistrationRecord:
         """How near it has come, how much of it the scan shows, and how far it has slid, in one line; ``of`` says what
         the scan is."""
         covered = f", {self.covered:.0%} lies under hair, cloth or a broken ear" if self.covered >= 0.005 else ""
-        slid = f"{of}'s landmarks inside the face lie {self.slid:.1f} mm from the mesh's own (median)"
+        slid = f"{of}'s landmarks inside the face lie {self.slid:.1f} mm from the bent template's (median)"
         if math.isnan(self.slid):
             slid = "without landmarks no figure says whether the mesh lies too far to a side on the skin"
         return (
