@@ -40,6 +40,8 @@ _SETTLED = 12.0  # reach of a stage, millimetres: from there on the template lie
 _MAX_COMPLETIONS = 6
 _MIN_MET = 0.1  # share of what faces outward; scans of faces alone under templates of whole heads give a quarter
 
+FALSE_COLORS = "the scan's colours are not a face's"
+"""How the note begins on colours by which neither hair nor cloth is looked for."""
 NO_COLORS = (
     "the scan has neither a texture with coordinates nor vertex colours (is the image that its material names beside "
     "it?); the result has no colours"
@@ -174,7 +176,7 @@ def register(
     notes += _final_notes(template, scan, deformer, texture_size)
     if cover.false_colors:
         notes.append(
-            f"the scan's colours are not a face's ({cover.false_colors}, in logarithms): no hair or cloth was looked "
+            f"{FALSE_COLORS} ({cover.false_colors}, in logarithms): no hair or cloth was looked "
             "for by them; --no-colors leaves them out of the result too"
         )
     colors = _scan_colors(scan, start.prepared)

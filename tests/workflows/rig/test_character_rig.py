@@ -286,7 +286,7 @@ def test_few_triangles_and_shapes_that_move_far_are_warned_of(tmp_path: Path, mo
     character = read_character(read_document(tmp_path / "a.glb"))
     face = character_face.find_character_face(character, character_face.textured(character))
     there, empty = present_shapes(character)
-    record = SimpleNamespace(figures=str, notes=())
+    record = SimpleNamespace(figures=str, remarks=())
     carried = SimpleNamespace(registration=SimpleNamespace(record=record))
     job = CharacterJob(character, face, carried, coarse, (), None, empty, (False, False))
     lines = job.notes(there, (), (0.0, 0.0))

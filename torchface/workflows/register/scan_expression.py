@@ -16,6 +16,7 @@ from torchface.landmarks.images.ibug_68 import COUNT, box_around
 from torchface.mesh import Mesh
 from torchface.registration import Registration
 from torchface.registration.scan_colors import has_colors, without_colors
+from torchface.registration.scan_registration import FALSE_COLORS
 from torchface.rendering.clay_shading import render
 from torchface.shape_names import ARKIT, mapping
 from torchface.viz.figures.face_views import frame_face
@@ -43,7 +44,7 @@ def front_view(scan: Mesh, registration: Registration, reference: Mesh) -> Front
     notes = registration.mesh.annotations
     if notes is None or notes.landmarks is None or len(notes.landmarks) != COUNT:
         return None
-    colored = has_colors(scan) and not any("colours are not a face's" in note for note in registration.record.notes)
+    colored = has_colors(scan) and not any(note.startswith(FALSE_COLORS) for note in registration.record.notes)
     mesh = registration.mesh.vertices.detach().cpu().double()
     upright = similarity_transform(mesh[None], reference.vertices.detach().cpu().double()[None], scale=False)
     placed = scan.with_vertices(upright.apply(scan.vertices.detach().cpu().double())[0].to(scan.vertices))

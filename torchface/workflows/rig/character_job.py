@@ -131,7 +131,8 @@ class CharacterJob:
         if (count := len(self.face.skin.faces)) < _COARSE:
             lines.append(f"  warning: its skin has {count:,} triangles, expected {_COARSE:,} for lids and lips to shut")
         lines.append(f"template: {record.figures('the head')}")
-        lines += [f"  note: {_of_the_head(note)}" for note in record.notes if not note.startswith(_OF_SCANS)]
+        remarks = (remark for remark in record.remarks if not remark.removeprefix("note: ").startswith(_OF_SCANS))
+        lines += [f"  {_of_the_head(remark)}" for remark in remarks]
         lines += [f"parts: {note}" for note in (() if self.parts is None else self.parts.notes)]
         if any(name in self.made for name in (*BLINKS, _JAW)):
             cut = self.parts is not None and self.parts.lips_cut
