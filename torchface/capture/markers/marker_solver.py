@@ -34,9 +34,8 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track
 from torchface.temporal import interpolated
 
-# On six real takes with 0.3 mm of noise the paper's rule (β‖w‖₁ as large as the squared error, thesis 4.1.4) gives 0.03
-# to 0.07, where the weights come out a fifth too small. At 0.01, of the rule's order of magnitude still, as many shapes
-# are active as in truth (25 of 53) and the error of the weights is near its minimum with 50 markers as with 100.
+# The paper's rule (β‖w‖₁ as large as the squared error, thesis 4.1.4) gives 0.03 to 0.07 on real takes, where weights
+# come out a fifth too small; at 0.01 as many shapes are active as in truth.
 SPARSITY = 0.01
 # Small against the smallest curvature that 100 markers give 53 real shapes, yet enough for layouts that see less.
 RIDGE = 1e-3
@@ -86,6 +85,8 @@ class MarkerSolver(nn.Module):
         True
     """
 
+    names: tuple[str, ...]
+    labels: tuple[str, ...]
     basis: Tensor
     rest: Tensor
     corrective_basis: Tensor | None
@@ -106,45 +107,30 @@ class MarkerSolver(nn.Module):
         checked_type("attachment", attachment, Attachment).check(rig.neutral)
         if program is not None:
             checked_type("program", program, ProjectedGradient)
-        own = program is not None and (
-            program.H is not None or bool((program.lower != 0).any() | (program.upper != 1).any())
-        )
-        if own:
+        if program is not None and (program.H is not None or bool(((program.lower != 0) | (program.upper != 1)).any())):
             raise ValueRangeError(f"program: found {program}, expected none of H or bounds, as of ProjectedGradient()")
-        faces = rig.neutral.faces
+        faces, residual = rig.neutral.faces, attachment.residual
         rest = attachment.on(faces, rig.vertices)
-        if attachment.residual is not None:
-            rest = rest + attachment.residual.to(rest)
+        rest = rest if residual is None else rest + residual.to(rest)
         basis = attachment.on(faces, rig.deltas).permute(1, 2, 0).contiguous()
-        self._register(rig.names, tuple(attachment.labels or ()), basis, rest, alignment, sparsity, ridge)
+        self.names, self.labels = rig.names, tuple(attachment.labels or ())
+        self._register(basis, rest, alignment, sparsity, ridge)
         if rig.correctives is not None:
             moved = attachment.on(faces, rig.correctives.deltas).permute(1, 2, 0).contiguous()
             self._correct(rig.correctives.definitions, moved)
         self.program, self.antagonists = program, checked_type("antagonists", antagonists, bool)
 
     def _register(
-        self,
-        names: Sequence[str],
-        labels: Sequence[str],
-        basis: Tensor,
-        rest: Tensor,
-        alignment: Similarity | None,
-        sparsity: float | Tensor,
-        ridge: float | Tensor,
+        self, basis: Tensor, rest: Tensor, alignment: Similarity | None, sparsity: float | Tensor, ridge: float | Tensor
     ) -> None:
-        self.names: tuple[str, ...] = tuple(names)
-        self.labels: tuple[str, ...] = tuple(labels)
-        self.sparsity = self._penalty("sparsity", sparsity)
-        self.ridge = self._penalty("ridge", ridge)
+        self.sparsity, self.ridge = self._penalty("sparsity", sparsity), self._penalty("ridge", ridge)
         self.register_buffer("basis", basis)
         self.register_buffer("rest", rest)
         if alignment is not None and alignment.scale.shape != (1,):
             raise ShapeError(f"alignment: found {tuple(alignment.scale.shape)} similarities, expected (1,)")
         for name in ("scale", "rotation", "translation"):
-            moved = None if alignment is None else getattr(alignment, name).to(rest)
-            self.register_buffer(f"alignment_{name}", moved)
+            self.register_buffer(f"alignment_{name}", None if alignment is None else getattr(alignment, name).to(rest))
         self.activation: CorrectiveActivation | None = None
-        self.program, self.antagonists = None, False
         self.register_buffer("corrective_basis", None)
         self._prepared: dict[float, Prepared[BoxQP]] = {}
         self._prepared_rows: Prepared[tuple[Tensor, Tensor]] = Prepared()
@@ -207,12 +193,11 @@ class MarkerSolver(nn.Module):
             torch.zeros(config["tensors"][name]) if name in config.get("tensors", {}) else config[name]
             for name in ("sparsity", "ridge")
         )
-        self._register(names, labels, basis, rest, alignment, sparsity, ridge)
-        if "correctives" in config:
-            definitions = definitions_from_records(config["correctives"])
+        self.names, self.labels = tuple(names), tuple(labels)
+        self._register(basis, rest, alignment, sparsity, ridge)
+        if definitions := definitions_from_records(config.get("correctives", [])):
             self._correct(definitions, torch.zeros(len(labels), 3, len(definitions)))
-        if "program" in config:
-            self.program = ProjectedGradient(**config["program"])
+        self.program = ProjectedGradient(**config["program"]) if "program" in config else None
         self.antagonists = config.get("antagonists", False) is True
         return self
 
@@ -224,41 +209,30 @@ class MarkerSolver(nn.Module):
 
     def regularization(self, like: Tensor) -> Quadratic:
         """The sparsity and the ridge term, in the dtype and on the device of ``like``."""
-        shapes = len(self.names)
-        return sparsity_term(shapes, self.sparsity, like) + ridge_term(shapes, self.ridge, like)
+        return sparsity_term(len(self.names), self.sparsity, like) + ridge_term(len(self.names), self.ridge, like)
 
     def energy(self, markers: Tensor) -> Quadratic | CorrectiveEnergy:
         """What the solve minimises for markers (B,M,3), float64."""
-        if self.activation is None or self.corrective_basis is None:
-            return self._linear_energy(markers)
-        rest, targets = self.rest.double(), self.in_rig_space(markers.double())
-        basis = torch.cat([self.basis, self.corrective_basis], 2).double()
-        return CorrectiveEnergy(marker_term(basis, rest, targets), self.activation) + self.regularization(rest)
-
-    def _linear_energy(self, markers: Tensor) -> Quadratic:
-        term = marker_term(self.basis.double(), self.rest.double(), self.in_rig_space(markers.double()))
-        return term + self.regularization(term.H)
+        rest = self.rest.double()
+        term = marker_term(self.every_basis.double(), rest, self.in_rig_space(markers.double()))
+        energy = term if self.activation is None else CorrectiveEnergy(term, self.activation)
+        return energy + self.regularization(rest)
 
     def points(self, weights: Tensor) -> Tensor:
         """Where the markers' sites are at weights (B,N): (B,M,3) in rig space, float64."""
-        weights = weights.double()
-        points = self.rest.double() + torch.einsum("mcn,bn->bmc", self.basis.double(), weights)
-        if self.activation is None or self.corrective_basis is None:
-            return points
-        return points + torch.einsum("mcn,bn->bmc", self.corrective_basis.double(), self.activation(weights))
+        values = weights.double()
+        if self.activation is not None:
+            values = torch.cat([values, self.activation(values)], 1)
+        return self.rest.double() + torch.einsum("mcn,bn->bmc", self.every_basis.double(), values)
 
     @property
     def every_basis(self) -> Tensor:
-        """What a unit of each shape, and of each corrective, adds to the markers, (M,3,N+C).
-
-        A model of the rig that is linear: it knows every motion that the rig has, and more.
-        """
+        """What a unit of each shape, and of each corrective, adds to the markers, (M,3,N+C)."""
         return self.basis if self.corrective_basis is None else torch.cat([self.basis, self.corrective_basis], 2)
 
     def squared_distance(self, markers: Tensor, weights: Tensor) -> Tensor:
         """Mean squared distance of the seen markers (B,M,3) to the rig at weights (B,N): (B,), mm² in rig space."""
-        squared = (self.points(weights) - self.in_rig_space(markers.double())).square().sum(-1)
-        return squared.nanmean(-1)
+        return (self.points(weights) - self.in_rig_space(markers.double())).square().sum(-1).nanmean(-1)
 
     @data_dependent("torchface.onnx.SolverGraph, which `torchface export solver` writes")
     def forward(self, markers: Tensor, initial: Tensor | None = None) -> Tensor:
@@ -282,29 +256,42 @@ class MarkerSolver(nn.Module):
         missing = torch.isnan(markers).any(-1)
         check_seen(missing)
         tolerance = default_tolerance(markers.dtype)
-        initial = None if initial is None else initial.double()
-        weights = self._solved(markers, missing.any(-1), initial, tolerance)
+        weights = self._solved(markers, missing.any(-1), None if initial is None else initial.double(), tolerance)
         return (self._one_sided(markers, weights, tolerance) if self.antagonists else weights).to(markers.dtype)
 
     def _solved(self, markers: Tensor, gaps: Tensor, initial: Tensor | None, tolerance: float) -> Tensor:
-        """Weights (B,N), float64."""
-        if self.activation is not None:
-            return self._corrected(markers, gaps, initial, tolerance)
+        """Weights (B,N), float64; with correctives by Gauss-Newton, from the answer without where nothing is given."""
+        far = self.activation is not None and initial is None
+        if far:
+            with torch.no_grad():
+                initial = self.without_correctives()(markers.detach()).double()
         if not bool(gaps.any()):
-            return self._complete(markers, initial, tolerance)
-        whole = (~gaps).nonzero()[:, 0]
-        rows, parts = [whole], [self._complete(markers[whole], None if initial is None else initial[whole], tolerance)]
+            return self._chunk(markers, True, initial, far, tolerance)
         # A frame with gaps has an H of its own; a chunk of them bounds the memory.
-        for chunk in chunks_of_frames(gaps.nonzero()[:, 0], len(self.names)):
-            energy = self._linear_energy(markers[chunk])
-            rows.append(chunk)
-            guess = None if initial is None else initial[chunk]
-            if self.program is None:
-                parts.append(box_qp(energy.H, energy.f, 0.0, 1.0, guess, tolerance))
-            else:
-                parts.append(self.program(energy.f, energy.H, guess))
+        whole = (~gaps).nonzero()[:, 0]
+        others = chunks_of_frames(gaps.nonzero()[:, 0], self.every_basis.shape[2])
+        chunks, parts = [whole, *others] if len(whole) else [*others], []
+        for rows in chunks:
+            guess = None if initial is None else initial[rows]
+            parts.append(self._chunk(markers[rows], rows is whole, guess, far, tolerance))
         weights = markers.new_zeros(len(markers), len(self.names), dtype=torch.float64)
-        return weights.index_copy(0, torch.cat(rows), torch.cat(parts))
+        return weights.index_copy(0, torch.cat(chunks), torch.cat(parts))
+
+    def _chunk(self, markers: Tensor, complete: bool, guess: Tensor | None, far: bool, tolerance: float) -> Tensor:
+        """Weights (B,N), float64, of markers all or none of which have gaps."""
+        if complete and self.activation is None:
+            f = self.complete_slope(markers)
+            if self.program is not None:
+                return self.program(f, self.complete_hessian(), guess)
+            return self._shared(tolerance)(f, guess)
+        energy = self.complete_energy(markers) if complete else self.energy(markers)
+        if isinstance(energy, CorrectiveEnergy):
+            assert guess is not None
+            lower = guess.new_zeros(len(self.names))
+            return least_in_box(energy, guess, lower, torch.ones_like(lower), tolerance, far)
+        if self.program is not None:
+            return self.program(energy.f, energy.H, guess)
+        return box_qp(energy.H, energy.f, 0.0, 1.0, guess, tolerance)
 
     def _one_sided(self, markers: Tensor, weights: Tensor, tolerance: float) -> Tensor:
         """Weights (B,N), float64, solved again with the weaker of two antagonists at 0 where both are above."""
@@ -313,8 +300,7 @@ class MarkerSolver(nn.Module):
         both = (weaker & (weights > 0)).any(1)
         for held in weaker[both].unique(dim=0):  # frames with the same sides at rest share a box
             for rows in chunks_of_frames((both & (weaker == held).all(1)).nonzero()[:, 0], len(self.names)):
-                upper, start = (~held).to(weights), weights[rows].detach() * ~held
-                energy = self.energy(markers[rows])
+                upper, start, energy = (~held).to(weights), weights[rows].detach() * ~held, self.energy(markers[rows])
                 part = least_in_box(energy, start, torch.zeros_like(upper), upper, tolerance, False)
                 weights = weights.index_copy(0, rows, part)
         return one_side(weights, signed)
@@ -350,35 +336,10 @@ class MarkerSolver(nn.Module):
         arranged = markers.values.new_full((len(markers), len(self.labels), 3), torch.nan)
         return arranged.index_copy(1, ids, markers.values).to(self.rest.device)
 
-    def _complete(self, markers: Tensor, initial: Tensor | None, tolerance: float) -> Tensor:
-        """Weights (B,N), float64, for markers without gaps: one H, factored on first use."""
-        f = self.complete_slope(markers)
-        if self.program is not None:
-            return self.program(f, self.complete_hessian(), initial)
-        return self._shared(tolerance)(f, initial)
-
     def complete_slope(self, markers: Tensor) -> Tensor:
         """The energy's slope at rest, (B,N), float64, for markers without gaps."""
         offset = self.rest.double() - self.in_rig_space(markers.double())
         return (2.0 / len(self.rest)) * (offset.flatten(1) @ self.basis.double().flatten(0, 1)) + self.sparsity
-
-    def _corrected(self, markers: Tensor, gaps: Tensor, initial: Tensor | None, tolerance: float) -> Tensor:
-        """Weights (B,N), float64, with correctives: Gauss-Newton from the answer without, or from a guess (B,N)."""
-        guessed = initial is not None
-        if initial is None:
-            with torch.no_grad():
-                initial = self.without_correctives()(markers.detach()).double()
-        lower, upper = torch.zeros_like(initial[0]), torch.ones_like(initial[0])
-        rows, parts = [], []
-        whole = (~gaps).nonzero()[:, 0]
-        size = self.basis.shape[-1] + (0 if self.corrective_basis is None else self.corrective_basis.shape[-1])
-        for chunk in [whole, *chunks_of_frames(gaps.nonzero()[:, 0], size)]:
-            if len(chunk):
-                energy = self.complete_energy(markers[chunk]) if chunk is whole else self.energy(markers[chunk])
-                assert isinstance(energy, CorrectiveEnergy)
-                rows.append(chunk)
-                parts.append(least_in_box(energy, initial[chunk], lower, upper, tolerance, not guessed))
-        return torch.zeros_like(initial).index_copy(0, torch.cat(rows), torch.cat(parts))
 
     @property
     def _learns(self) -> bool:
@@ -390,18 +351,16 @@ class MarkerSolver(nn.Module):
         """``energy`` of markers without gaps, its H formed on first use."""
         if self._learns:
             return self.energy(markers)
-        assert self.corrective_basis is not None
-        assert self.activation is not None
-        H, rows = self._prepared_rows.get((self.basis, self.corrective_basis), self._extended_rows)
+        made_of = (self.basis,) if self.corrective_basis is None else (self.basis, self.corrective_basis)
+        H, rows = self._prepared_rows.get(made_of, self._extended_rows)
         offset = (self.rest.double() - self.in_rig_space(markers.double())).flatten(1)
         share = 2.0 / len(self.rest)
         term = Quadratic(H, share * (offset @ rows), 0.5 * share * offset.square().sum(1))
-        return CorrectiveEnergy(term, self.activation) + self.regularization(H)
+        return (term if self.activation is None else CorrectiveEnergy(term, self.activation)) + self.regularization(H)
 
     def _extended_rows(self) -> tuple[Tensor, Tensor]:
         """Of shapes and correctives: H (N+C,N+C) of complete frames, and what each does to the markers (3M,N+C)."""
-        assert self.corrective_basis is not None
-        rows = torch.cat([self.basis, self.corrective_basis], 2).double().flatten(0, 1)
+        rows = self.every_basis.double().flatten(0, 1)
         return (2.0 / len(self.rest)) * (rows.T @ rows), rows
 
     def without_correctives(self) -> "MarkerSolver":
@@ -424,8 +383,7 @@ class MarkerSolver(nn.Module):
     def complete_hessian(self) -> Tensor:
         """The energy's H, (N,N), float64, for markers without gaps."""
         rest = self.rest.double()
-        H = marker_term(self.basis.double(), rest, rest[None]).H
-        return H + self.regularization(H).H
+        return (marker_term(self.basis.double(), rest, rest[None]) + self.regularization(rest)).H
 
     def in_rig_space(self, markers: Tensor) -> Tensor:
         """Markers (B,M,3) moved by the alignment, where there is one."""
@@ -433,8 +391,8 @@ class MarkerSolver(nn.Module):
         return markers if alignment is None else alignment.apply(markers)
 
     def extra_repr(self) -> str:
-        penalties = f"sparsity={penalty_value(self.sparsity):g}, ridge={penalty_value(self.ridge):g}"
-        return f"{len(self.labels)} markers, {len(self.names)} shapes, {penalties}"
+        sparsity, ridge = penalty_value(self.sparsity), penalty_value(self.ridge)
+        return f"{len(self.labels)} markers, {len(self.names)} shapes, sparsity={sparsity:g}, ridge={ridge:g}"
 
 
 def penalty_value(penalty: float | Tensor) -> float:
