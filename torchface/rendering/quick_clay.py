@@ -83,13 +83,12 @@ class QuickClay:
             inside, lips = self.mouth
             apart = float((points[lips[0]] - points[lips[1]]).norm())
             lit[inside] *= min(_BEHIND_LIPS + apart / _LIPS_APART, 1.0)
-        light = drawn.interpolated(lit[self.faces])
-        row = self.part[drawn.triangle] * _TINT_LEVELS
+        light = drawn.interpolated(lit.take(self.faces))
+        row = self.part * _TINT_LEVELS
         if tint is not None:
-            level = (tint[self.faces].mean(1) * (_TINT_LEVELS - 1)).round().clamp(0, _TINT_LEVELS - 1).long()
-            row = row + level[drawn.triangle]
-        index = row * _LEVELS + (light * (_LEVELS - 1)).clamp(0, _LEVELS - 1).long()
-        colors = self.colors[index.numpy()]
+            row = row + (tint[self.faces].mean(1) * (_TINT_LEVELS - 1)).round().clamp(0, _TINT_LEVELS - 1).long()
+        index = (row * _LEVELS)[drawn.triangle] + (light * (_LEVELS - 1)).clamp(0, _LEVELS - 1).long()
+        colors = self.colors.take(index.numpy())
         if self.paint is not None:
             self._paint_skin(colors, drawn, light)
         image[drawn.pixel.numpy()] = colors
@@ -162,7 +161,5 @@ def _smooth_edges(image: np.ndarray, drawn: DrawnPixels) -> np.ndarray:
     near = np.zeros(image.shape[:2], np.float32)
     near.reshape(-1)[drawn.pixel.numpy()] = drawn.nearness.numpy()
     square = np.ones((3, 3), np.uint8)
-    edge = cv2.dilate(near, square) - cv2.erode(near, square) > _JUMP * near.max(initial=0.0)
-    rows, columns = np.nonzero(edge)
-    image[rows, columns] = cv2.GaussianBlur(image, (3, 3), 0)[rows, columns]
-    return image
+    edge = cv2.morphologyEx(near, cv2.MORPH_GRADIENT, square) > _JUMP * near.max(initial=0.0)
+    return cv2.copyTo(cv2.GaussianBlur(image, (3, 3), 0), edge.view(np.uint8), image)

@@ -137,7 +137,7 @@ class DrawnPixels:
 
     def interpolated(self, values: Tensor) -> Tensor:
         """Values (F,3) of triangles' corners at the pixels, (S,) float32, linear in the image."""
-        corners = values.numpy()[self.planes.triangle].T
+        corners = values.numpy().take(self.planes.triangle, axis=0).T
         return torch.from_numpy(_at_pixels(self.planes.linear(corners), *self.at))
 
 
@@ -190,7 +190,7 @@ def _nearest(pixel: np.ndarray, nearness: np.ndarray, count: int) -> np.ndarray:
     best = np.full(count, -np.inf, np.float32)
     np.maximum.at(best, pixel, nearness)
     winners = np.flatnonzero(nearness >= best.take(pixel))
-    chosen = np.full(count, -1)
+    chosen = np.full(count, -1, np.int32)
     chosen[pixel[winners]] = winners  # of samples that are equally near, one
     return chosen[chosen >= 0]
 

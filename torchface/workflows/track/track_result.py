@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from math import nan
 from pathlib import Path
 
@@ -109,7 +110,7 @@ class Tracked:
         """When a frame is shown."""
         return frame / self.video.fps if self.times is None else float(self.times[frame])
 
-    @property
+    @cached_property
     def seen(self) -> Tensor:
         """Frames in which the face was found, (T,) bool."""
         return self.reading.found
