@@ -24,8 +24,8 @@ from torchface.optim.prepared_tensors import Prepared
 from torchface.progress import Progress
 
 _NUMBERS = 2**21  # vertices of all frames that are enhanced at a time
-# Of the distance from which on a frame is outside, until where a linear map is trusted: with what it does to the
-# motion that the smooth part lacks far, for that goes on linearly; with wrinkles alone not so, for they saturate.
+# Of the distance from which on a frame is outside, until where a linear map is trusted: motion that the smooth part
+# lacks goes on linearly, wrinkles saturate.
 _REACH, _REACH_OF_WRINKLES = 2.0, 0.5
 # Of that distance: a frame that goes so much further than all of the database in its own direction is outside as well.
 _FURTHER = 0.5
@@ -122,8 +122,7 @@ class EnhancementModel(nn.Module):
         self.lost_share = checked_number("lost_share", lost_share, 0.0, 1.0)
         self.keeps_input = bool(keeps_input)
         self.scale = checked_number("scale", scale, most=_MOST_SCALE)
-        vertices, triangles, frames = sizes.vertices, sizes.triangles, sizes.frames
-        regions = len(self.region_names)
+        vertices, triangles, frames, regions = sizes.vertices, sizes.triangles, sizes.frames, len(self.region_names)
         self.register_buffer("neutral", torch.zeros(vertices, 3))
         self.register_buffer("faces", torch.zeros(triangles, 3, dtype=torch.int64))
         self.register_buffer("patches", torch.zeros(triangles, dtype=torch.int64))
@@ -136,8 +135,7 @@ class EnhancementModel(nn.Module):
         size = 3 * vertices if settings.detail == "displacements" else 9 * triangles
         self.register_buffer("components", torch.zeros(sizes.rank, size, dtype=torch.float16))
         self.register_buffer("coefficients", torch.zeros(frames, sizes.rank))
-        color_rank = sizes.color_rank
-        colored = vertices if color_rank else 0
+        color_rank, colored = sizes.color_rank, vertices if sizes.color_rank else 0
         self.register_buffer("mean_color", torch.zeros(colored, 3))
         self.register_buffer("color_components", torch.zeros(color_rank, 3 * colored, dtype=torch.float16))
         self.register_buffer("color_coefficients", torch.zeros(frames if color_rank else 0, color_rank))
@@ -156,7 +154,7 @@ class EnhancementModel(nn.Module):
         folder: str | Path | None = None,
         progress: Progress | None = None,
     ) -> "EnhancementModel":
-        """Learns from a captured performance.
+        """Learns from a captured performance; ``lost_share`` of the details' energy is what the components do not hold.
 
         Args:
             performance: K frames of the actor.
@@ -167,9 +165,6 @@ class EnhancementModel(nn.Module):
             seed: of patches and regions.
             folder: where a run that is killed finds what it has learned; of this run alone.
             progress: called with each step and the frames that are done.
-
-        Returns:
-            The model. ``lost_share`` says what part of the details' energy its components do not hold.
 
         Raises:
             TopologyError: vertices of frames are in another order.
@@ -210,9 +205,7 @@ class EnhancementModel(nn.Module):
         if not all(isinstance(choice, bool) for choice in choices):
             raise ValueRangeError("voluntary or keeps_input: found neither true nor false, expected one")
         sizes = EnhancementSizes(**{size.name: given.pop(size.name) for size in fields(EnhancementSizes)})
-        settings = EnhancementSettings(
-            **{setting.name: given.pop(setting.name) for setting in fields(EnhancementSettings)}
-        )
+        settings = EnhancementSettings(**{one.name: given.pop(one.name) for one in fields(EnhancementSettings)})
         return cls(sizes, settings=settings, **given)
 
     @property
@@ -246,12 +239,7 @@ class EnhancementModel(nn.Module):
             regions, frames = len(self.region_names), len(self.sequences)
             none = coarse.new_zeros(0, regions)
             return Enhancement(coarse, coarse.new_zeros(0, regions, frames), none, none.bool())
-        return Enhancement(
-            torch.cat([piece.vertices for piece in pieces]),
-            torch.cat([piece.weights for piece in pieces]),
-            torch.cat([piece.distances for piece in pieces]),
-            torch.cat([piece.outside for piece in pieces]),
-        )
+        return Enhancement(*(torch.cat([getattr(piece, f.name) for piece in pieces]) for f in fields(Enhancement)))
 
     def features(self, coarse: Tensor) -> Tensor:
         """Rotation vector and stretch of each patch of the smooth part, (T,P,9), of frames (T,V,3)."""
@@ -315,9 +303,9 @@ class EnhancementModel(nn.Module):
             raise TopologyError(f"neutral: found {tuple(neutral.shape)}, expected {tuple(self.neutral.shape)}")
         if not bool(torch.isfinite(neutral).all()):
             raise ValueRangeError("neutral: found NaN or infinite vertices, expected none")
+        neutral = neutral.detach().to(self.neutral)[None]
         # Features and details have axes: those of this head.
-        pose = similarity_transform(neutral.detach().to(self.neutral)[None], self.neutral[None], scale=False)
-        neutral = pose.apply(neutral.detach().to(self.neutral)[None])[0]
+        neutral = similarity_transform(neutral, self.neutral[None], scale=False).apply(neutral)[0]
         other = copy.deepcopy(self)
         sizes = [float(vertex_areas(head, self.faces).sum()) ** 0.5 for head in (neutral, self.neutral)]
         other.settings = replace(self.settings, wavelength=self.settings.wavelength * sizes[0] / sizes[1])
@@ -344,16 +332,8 @@ class EnhancementModel(nn.Module):
     @property
     def prepared(self) -> PreparedDatabase:
         """What is computed once of the state and kept until the state changes."""
-        database = PreparedDatabase(
-            self.neutral,
-            self.faces,
-            self.patches,
-            self.sequences,
-            self.database_features,
-            self.coefficients,
-            self.regions,
-            self.settings,
-        )
+        parts = self.neutral, self.faces, self.patches, self.sequences, self.database_features, self.coefficients
+        database = PreparedDatabase(*parts, self.regions, self.settings)
         return self._prepared.get(database.inputs, lambda: database)
 
     def check_state(self) -> None:
@@ -399,9 +379,8 @@ class EnhancementModel(nn.Module):
         if self.scale != 1.0:
             vertices = own + self.scale * (vertices - own)
         limits = self.limits.to(matched.distances)
-        outside = matched.distances > limits
-        if matched.excess is not None:
-            outside = outside | (matched.excess > _FURTHER * limits)
+        further = False if matched.excess is None else matched.excess > _FURTHER * limits
+        outside = (matched.distances > limits) | further
         return Enhancement(pose.inverse().apply(vertices), matched.weights, matched.distances, outside)
 
     def _smooth(self, coarse: Tensor) -> tuple[Tensor, Tensor, Similarity]:
