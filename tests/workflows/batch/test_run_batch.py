@@ -65,6 +65,8 @@ def test_bad_items_are_told_and_the_others_are_done(words: Path) -> None:
     with pytest.warns(UserWarning, match="found other content than was written"):
         changed = run(words)
     assert [outcome.name for outcome in changed.outcomes if not outcome.reused] == ["anna", "bob"]
+    (report.out / "records" / "cy.json").write_text("{")
+    assert [outcome.name for outcome in run(words).outcomes if not outcome.reused] == ["cy"]
 
 
 def test_one_that_dies_and_one_at_the_time_limit_take_no_other_along(words: Path) -> None:

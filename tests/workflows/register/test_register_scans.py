@@ -5,7 +5,6 @@ import json
 import multiprocessing
 import os
 import random
-import shutil
 import signal
 import time
 from collections.abc import Callable
@@ -23,7 +22,6 @@ from torchface.registration import Level, Schedule, Stage, load_scan_landmarks, 
 from torchface.registration.model_fit import LinearShape
 from torchface.workflows.batch.batch_items import BatchItem, find_items
 from torchface.workflows.batch.batch_job import picture_path
-from torchface.workflows.batch.outcomes import Outcome
 from torchface.workflows.batch.run_batch import BatchOptions, BatchReport
 from torchface.workflows.register.register_scans import SCANS, ScanSettings, register_scans
 from torchface.workflows.register.scan_job import ScanJob
@@ -142,39 +140,6 @@ def test_bad_scans_are_told_and_skipped(scans: Path, done: BatchReport) -> None:
     assert record["details"]["stages"][0]["stiffness"] == 8.0
 
 
-def test_only_what_has_changed_is_registered_again(
-    template: Mesh, scans: Path, done: BatchReport, tmp_path: Path
-) -> None:
-    own, out = tmp_path / "scans", tmp_path / "out"
-    shutil.copytree(scans, own)
-    for i in range(2, COUNT):
-        (own / f"s{i}.ply").unlink()
-    first = run(template, own, out)
-    assert not any(entry.reused for entry in first.outcomes)
-    told: list[tuple[int, int]] = []
-    again = run(template, own, out, progress=lambda _, done, total: told.append((done, total)))
-    assert all(entry.reused for entry in again.outcomes)
-    assert told == [(3, 3)]
-    assert [e.figures["median_mm"] for e in again.done] == [e.figures["median_mm"] for e in first.done]
-    size = (out / "s0.glb").stat().st_size
-    (out / "s0.glb").write_bytes(bytes(size))  # what a disk may leave of a result when the power fails
-    state = (own / "s1.ljson").stat()
-    text = (own / "s1.ljson").read_text()
-    digit = text.rindex(".") + 5
-    (own / "s1.ljson").write_text(text[:digit] + ("1" if text[digit] == "0" else "0") + text[digit + 1 :])
-    os.utime(own / "s1.ljson", ns=(state.st_atime_ns, state.st_mtime_ns))  # neither size nor date tell
-    with pytest.warns(UserWarning, match=r"s0\.glb: found other content than was written"):
-        after = run(template, own, out)
-    assert {entry.name: entry.reused for entry in after.outcomes} == {"bad": True, "s0": False, "s1": False}
-    (out / "records" / "s0.json").write_text("{")
-    shutil.copy(own / "s1.ply", own / "bad.ply")
-    mended = run(template, own, out)
-    assert {entry.name: entry.reused for entry in mended.outcomes} == {"bad": False, "s0": False, "s1": True}
-    assert len(mended.done) == 3
-    other = template.with_vertices(template.vertices * 1.01)
-    assert not any(entry.reused for entry in run(other, own, out).outcomes)
-
-
 def test_a_run_killed_at_random_moments_leaves_whole_files_and_goes_on(
     template: Mesh, scans: Path, done: BatchReport, tmp_path: Path
 ) -> None:
@@ -211,34 +176,6 @@ def test_a_run_killed_at_random_moments_leaves_whole_files_and_goes_on(
     assert [entry.name for entry in end.done] == [entry.name for entry in done.done]
     assert sum(entry.reused for entry in end.outcomes) >= len(kept)
     assert not list(out.glob(".*.part"))
-    for entry, whole in zip(end.done, done.done, strict=True):
-        assert entry.results
-        assert whole.results
-        torch.testing.assert_close(
-            load_mesh(entry.results[0]).vertices, load_mesh(whole.results[0]).vertices, atol=1e-3, rtol=0
-        )
-
-
-@pytest.mark.bench  # two processes load the library; tests/workflows/batch tries what becomes of one that dies
-def test_processes_give_the_same_and_one_that_dies_takes_only_its_scan(
-    template: Mesh, scans: Path, done: BatchReport, tmp_path: Path
-) -> None:
-    killed: list[int] = []
-
-    def kill_one(entry: Outcome) -> None:
-        victims = [child for child in multiprocessing.active_children() if child.pid is not None]
-        if not killed and victims and entry.done:
-            killed.append(victims[0].pid or 0)
-            os.kill(killed[0], signal.SIGKILL)
-
-    first = run(template, scans, tmp_path, options=BatchOptions(2), finished=kill_one)
-    assert killed
-    assert len(first.outcomes) == COUNT + 1
-    lost = [entry for entry in first.skipped if entry.name != "bad"]
-    assert len(lost) <= 1
-    assert all("signal 9" in entry.error for entry in lost)
-    end = run(template, scans, tmp_path)  # what died is tried again
-    assert [entry.name for entry in end.skipped] == ["bad"]
     for entry, whole in zip(end.done, done.done, strict=True):
         assert entry.results
         assert whole.results

@@ -290,15 +290,6 @@ def test_parts_far_apart_move_apart(film: PortraitVideo) -> None:
     assert believed[0] > 0.96 > believed[1]
 
 
-def test_models_come_back_from_files(film: PortraitVideo, model: AppearanceModel, tmp_path: Path) -> None:
-    zoo.save_model(model, tmp_path / "actor", zoo.ModelCard("MIT", "a film", {}, "none"))
-    again = zoo.get_model(tmp_path / "actor")
-    assert type(again) is AppearanceModel
-    assert again.settings == model.settings
-    start = half_neutral(film)[:2]
-    assert torch.equal(again(images(film)[:2], start), model(images(film)[:2], start))
-
-
 def broken_corner(model: AppearanceModel) -> None:
     model.levels[0].corner[3, 1] = 78
 
