@@ -73,6 +73,7 @@ class ActionLabels:
         regions: boxes (left, top, right, bottom) by name.
         performed: what was done when, in any order; empty for a video that is only to be classified.
         groups: which regions show which units, where these are others than the usual.
+        offset: when the video began after the marker take, seconds.
         source: the file, for messages.
 
     Raises:
@@ -93,6 +94,7 @@ class ActionLabels:
     regions: dict[str, Box]
     performed: tuple[Performed, ...] = ()
     groups: tuple[RegionGroup, ...] = ()
+    offset: float = 0.0
     source: str = field(default="labels", compare=False)
 
     def __post_init__(self) -> None:
@@ -172,6 +174,7 @@ def load_action_labels(path: str | Path) -> ActionLabels:
             )
             for group in (document["groups"].rows() if document["groups"] else [])
         ),
+        document["offset"].number() if document["offset"] else 0.0,
         str(path),
     )
 

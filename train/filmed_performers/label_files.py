@@ -13,6 +13,7 @@ def save_action_labels(labels: ActionLabels, path: str | Path) -> None:
         "format": "torchface.action_labels/1",
         "frames": labels.frames,
         "neutral": labels.neutral,
+        "offset": labels.offset,
         "helmet": list(labels.helmet),
         "markers": [list(point) for point in labels.markers],
         "regions": {name: list(box) for name, box in labels.regions.items()},

@@ -1,5 +1,7 @@
 """Where a classifier's curves of a film lead the solve of its markers."""
 
+from dataclasses import replace
+
 import torch
 
 from torchface.capture import ActionUnitClassifier, CurveSettings
@@ -24,3 +26,21 @@ def test_where_the_classifier_leads(
     assert blinks.any()
     assert torch.equal(asked.active[:, names.index("eyeBlinkLeft")], ~blinks)
     assert bool(asked.active[:, names.index("cheekSquintLeft")].all())
+
+
+def test_frames_that_hide_the_paint_are_left_to_the_markers(
+    classifier: ActionUnitClassifier, regions: RegionVideo, session: RecordedSession
+) -> None:
+    """A hand before the brows for half a second, while nothing else is hidden."""
+    names, table = session.rig.names, load_shape_table("arkit")
+    hidden, patterns = slice(60, 70), regions.patterns.clone()
+    patterns[hidden, regions.names.index("brow_left")] = 0.0
+    whole = action_unit_curves(classifier, regions, session.labels, table, names)
+    found = action_unit_curves(classifier, replace(regions, patterns=patterns), session.labels, table, names)
+    brow, pucker = names.index("browInnerUp"), names.index("mouthPucker")
+    assert whole.seen.all()
+    assert whole.active[hidden, brow].any()
+    assert not found.active[hidden, brow].any()
+    assert torch.equal(found.active[:, pucker], whole.active[:, pucker])
+    beside = found.levels[[hidden.start - 1, hidden.stop], found.units.index("1+2")]
+    assert found.levels[hidden, found.units.index("1+2")].amax() <= beside.amax()

@@ -33,6 +33,7 @@ def test_the_video_leads_what_markers_hardly_see(
         errors.append((session.rig.weights_from(solved) - session.performance.weights).abs().mean(0))
     told = capsys.readouterr().err
     assert "video: predicts" in told
+    assert "correlate" not in told
     led = session.rig.index(["noseSneerLeft", "noseSneerRight", "cheekSquintLeft", "cheekSquintRight"])
     alone, hybrid = errors
     assert float(hybrid[led].mean()) < 0.7 * float(alone[led].mean())

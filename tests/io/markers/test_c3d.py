@@ -223,6 +223,17 @@ def test_a_frame_range_kept_only_in_the_trial_group_is_found(tmp_path: Path) -> 
     assert load_c3d(tmp_path / "again.c3d").extras["frame_numbers"].tolist() == list(range(100_000, 100_006))
 
 
+@pytest.mark.parametrize("last", [4464, 65535])
+@pytest.mark.parametrize("kind", [2, 4])
+def test_counts_of_16_bits_that_began_again_or_stopped_are_not_believed(last: int, kind: int, tmp_path: Path) -> None:
+    """70,000 frames are 4,464 modulo 65,536; programs write that, or 65,535, and the whole number as a float or not."""
+    points = np.ones((70_000, 1, 4), np.float32)
+    count = struct.pack("<H", last) if kind == 2 else struct.pack("<f", 70_000)
+    path = tmp_path / "take.c3d"
+    path.write_bytes(_build(points, parameters={(1, "FRAMES"): (kind, (), count)}, last_frame=last))
+    assert len(load_c3d(path)) == 70_000
+
+
 def test_a_frame_without_a_marker_loads_and_is_named_on_request(tmp_path: Path) -> None:
     take = _take()
     take.markers.values[[2, 5]] = torch.nan

@@ -9,7 +9,7 @@ from torchface import Take, Track, zoo
 from torchface.capture.action_units import ActionUnitClassifier, ActionUnitCurves
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.io.action_labels import load_action_labels
-from torchface.workflows.solve.head_camera import HeadCamera, predicted_curves, resampled_curves
+from torchface.workflows.solve.head_camera import HeadCamera, predicted_curves, resampled_curves, video_warnings
 
 
 def curves(frames: int, fps: float) -> ActionUnitCurves:
@@ -18,7 +18,8 @@ def curves(frames: int, fps: float) -> ActionUnitCurves:
     up = ((time > 0.5) & (time < 1.0)).float()
     weights = torch.stack([up * (2 * torch.pi * (time - 0.5)).sin(), torch.zeros(frames)], 1)
     active = torch.stack([up > 0, torch.zeros(frames, dtype=torch.bool)], 1)
-    return ActionUnitCurves(("browInnerUp", "jawOpen"), weights, active, ("1+2",), up[:, None], up[:, None], fps)
+    levels, seen = up[:, None], torch.ones(frames, 1, dtype=torch.bool)
+    return ActionUnitCurves(("browInnerUp", "jawOpen"), weights, active, ("1+2",), levels, levels, fps, seen)
 
 
 def take(frames: int, fps: float) -> Take:
@@ -50,6 +51,27 @@ def test_where_the_video_ends_the_markers_are_alone() -> None:
     longer = resampled_curves(curves(90, 60), take(50, 60))
     assert "40 frames after the take" in longer.notes[0]
     assert len(longer.weights) == 50
+
+
+def test_a_video_that_began_later_is_moved_by_its_offset() -> None:
+    found = resampled_curves(curves(90, 60), take(90, 60), offset=0.25)
+    torch.testing.assert_close(found.weights.values[15:, 0, 0], curves(90, 60).weights[:75, 0])
+    assert "begins 15 frames after the take" in found.notes[0]
+    assert not found.gamma.values[:30].any()
+    assert float(found.gamma.values[60, 0, 0]) == 4.0
+
+
+def test_a_video_that_does_not_go_with_the_markers_is_said_with_its_offset() -> None:
+    """Weights of the markers alone show the brow that the video shows, 0.2 s later."""
+    predicted = resampled_curves(curves(90, 60), take(90, 60))
+    together = Take(60, weights=Track(("browInnerUp",), curves(90, 60).weights[:, :1, None] * 0.8))
+    later = Take(60, weights=Track(("browInnerUp",), together.weights.values.roll(12, 0)))
+    still = Take(60, weights=Track(("browInnerUp",), 0.01 * together.weights.values.roll(40, 0)))
+    assert video_warnings(together, predicted) == video_warnings(still, predicted) == []
+    (warning,) = video_warnings(later, predicted)
+    assert "(by 0.95 with `offset` in its labels +0.20 s from now)" in warning
+    moved = resampled_curves(curves(90, 60), take(90, 60), offset=0.2)
+    assert video_warnings(later, moved) == []
 
 
 def test_gamma_is_the_largest_weight_of_a_prediction() -> None:

@@ -14,7 +14,7 @@ from torchface.errors import NameMismatchError, ShapeError
 from torchface.io.action_labels import ActionLabels
 from torchface.io.video import VideoFile
 from torchface.progress import Progress
-from torchface.temporal import savitzky_golay
+from torchface.temporal import interpolated, savitzky_golay
 
 WINDOW = 25  # frames at 60 a second; a blink is over sooner than the others, so its window is the shortest
 WINDOWS: dict[str, int] = {"45": 15, "7": 21, "6+43": 21, "18L": 29, "18R": 29}  # Windows of units that have their own
@@ -22,6 +22,7 @@ WINDOWS: dict[str, int] = {"45": 15, "7": 21, "6+43": 21, "18L": 29, "18R": 29} 
 _RATE = 60.0
 _MIN_WINDOW = 5
 _CHUNK = 256
+_LEAST_PAINT, _MOST_PAINT = 0.4, 3.0  # beside that at rest; expressions show 0.7 to 1.8 of it
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +37,7 @@ class ActionUnitCurves:
         intensities: smooth, (T,A) in [0,1].
         levels: predicted frame by frame, (T,A).
         fps: frames a second.
+        seen: whether the regions of each unit show about as much paint as at rest, (T,A) bool.
     """
 
     names: tuple[str, ...]
@@ -45,6 +47,7 @@ class ActionUnitCurves:
     intensities: Tensor
     levels: Tensor
     fps: float
+    seen: Tensor
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,8 @@ def action_unit_curves(
 
     A shape that several units move follows the one that moves it most. The prediction of a shape is used where a
     unit that moves it is active, and where none is: shapes that markers hardly observe fit their noise there. Where
-    only a unit is active that is not to be used, the shape is left to the markers.
+    only a unit is active that is not to be used, or the paint of a unit that moves it is hidden, it is left to the
+    markers.
 
     Args:
         classifier: a trained one.
@@ -106,13 +110,27 @@ def action_unit_curves(
         matrix = whole * torch.tensor([[float(unit in units)] for unit in classifier.units])
     if not isinstance(video, RegionVideo):
         video = read_regions(video, labels, classifier.regions, classifier.neutral, classifier.size, progress=progress)
-    levels = classify(classifier, video)
+    seen = _paint_seen(classifier, video)
+    # What is before the lens for a while is no expression; the curve goes on over it.
+    levels = classify(classifier, video) * seen
+    for unit, shown in enumerate(seen.T):
+        levels[:, unit] = interpolated(levels[shown, unit], shown.nonzero()[:, 0], len(levels)) if shown.any() else 0.0
     intensities = smooth_intensities(levels, classifier.units, settings.windows, fps=video.fps)
     weights = (intensities[:, :, None] * matrix).amax(1)
     active = _moved(levels, matrix)
     if settings.at_rest:
         active |= (matrix > 0).any(0) & ~_moved(levels, whole)
-    return ActionUnitCurves(tuple(names), weights.clamp(0, 1), active, classifier.units, intensities, levels, video.fps)
+    active &= ~_moved(~seen, matrix)
+    weights = weights.clamp(0, 1)
+    return ActionUnitCurves(tuple(names), weights, active, classifier.units, intensities, levels, video.fps, seen)
+
+
+def _paint_seen(classifier: ActionUnitClassifier, video: RegionVideo) -> Tensor:
+    """Whether the regions of each unit show about as much paint as at rest, (T,A) bool."""
+    share = video.patterns.mean((2, 3)) / video.rest.mean((1, 2))
+    seen = dict(zip(video.names, ((share > _LEAST_PAINT) & (share < _MOST_PAINT)).T, strict=True))
+    shown = {unit: group.regions for group in classifier.groups for unit in group.units}
+    return torch.stack([torch.stack([seen[name] for name in shown[unit]]).all(0) for unit in classifier.units], 1)
 
 
 def smooth_intensities(

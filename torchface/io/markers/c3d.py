@@ -91,18 +91,15 @@ def _first_frame(sections: Sections) -> int:
     return sections.header.first_frame
 
 
-def _frame_counts(sections: Sections) -> list[float]:
-    """What the file's fields say, the most reliable first; the header's own 16 bits end at frame 65,535."""
+def _frame_counts(sections: Sections, room: int) -> list[float]:
+    """What the file's fields say, the most reliable first; 16 bits of them end at 65,535 or begin again from 0."""
     header = sections.header
     last = sections.numbers("TRIAL:ACTUAL_END_FIELD")
-    counts = []
-    if len(last) >= 2:
-        counts.append(last[0] + 65536 * last[1] - _first_frame(sections) + 1)
-    if header.last_frame < _MAX_COUNT:
-        counts.append(header.last_frame - header.first_frame + 1)
-    counts += sections.numbers("POINT:LONG_FRAMES")[:1] + sections.numbers("POINT:FRAMES")[:1]
-    counts.append(header.last_frame - header.first_frame + 1)
-    return counts
+    stated = sections.numbers("POINT:LONG_FRAMES")[:1] + sections.numbers("POINT:FRAMES")[:1]
+    counts = [last[0] + 65536 * last[1] - _first_frame(sections) + 1] if len(last) >= 2 else []
+    counts += [count for count in stated if count > _MAX_COUNT]
+    counts.append(room if header.last_frame == _MAX_COUNT else header.last_frame - header.first_frame + 1)
+    return counts + stated
 
 
 def _positions(data: bytes, sections: Sections, path: Path) -> np.ndarray:
@@ -118,7 +115,7 @@ def _positions(data: bytes, sections: Sections, path: Path) -> np.ndarray:
     start = BLOCK * (int(first_block) - 1)
     frame_size = word * (4 * header.points + header.analog)
     room = max(0, len(data) - start) // frame_size
-    counts = [count for count in _frame_counts(sections) if count >= 1 and float(count).is_integer()]
+    counts = [count for count in _frame_counts(sections, room) if count >= 1 and float(count).is_integer()]
     if not counts:
         raise FileFormatError(f"{path}: found no frames, expected at least one")
     fitting = [int(count) for count in counts if count <= room]
@@ -127,7 +124,7 @@ def _positions(data: bytes, sections: Sections, path: Path) -> np.ndarray:
             f"{path}: found {counts[0]:.0f} frames of {frame_size} bytes announced and room for {room} behind byte "
             f"{start}, expected all of them; is the file cut off?"
         )
-    frames = fitting[0]
+    frames = fitting[0] + (room - fitting[0]) // 65536 * 65536  # 16 bits began again
     rows = np.frombuffer(data, np.uint8, frames * frame_size, start).reshape(frames, frame_size)
     block = np.ascontiguousarray(rows[:, : 4 * word * header.points])
     if word == 4:

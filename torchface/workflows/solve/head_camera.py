@@ -15,8 +15,10 @@ from torchface.errors import FileFormatError, NameMismatchError
 from torchface.io.action_labels import load_action_labels
 from torchface.progress import Progress
 from torchface.take import Take, Track
+from torchface.temporal.interpolation import frames_beside, values_at
 
-_SAME_RATE = 1e-3
+_SAME_RATE, _ROUNDING = 1e-3, 1e-6
+_AGREES, _MOVES = 0.5, 0.05  # a correlation; the deviation of a weight that markers show to move
 _BLEND_SECONDS, _MIN_BLEND_FRAMES = 15 / 60, 5
 
 
@@ -52,8 +54,8 @@ def predicted_curves(
 ) -> Predicted:
     """Classifies the video and resamples its predictions to the take's frames.
 
-    Video and take begin together; a video of another rate is resampled to the take's, and where it ends before the
-    take the markers are left alone.
+    They begin together unless the labels say otherwise; a video of another rate is resampled to the take's, and where
+    the take has no frame of it the markers are left alone.
     """
     classifier = zoo.get_model(camera.classifier, ActionUnitClassifier)
     if unknown := [unit for unit in camera.units if unit not in classifier.units]:
@@ -73,32 +75,62 @@ def predicted_curves(
     table = load_shape_table(camera.table if camera.table is not None else _fitting_table(classifier.units, names))
     settings = CurveSettings(units=camera.units or None)
     curves = action_unit_curves(classifier, camera.video, labels, table, names, settings, progress)
-    return resampled_curves(curves, take, camera.gamma)
+    return resampled_curves(curves, take, camera.gamma, labels.offset)
 
 
-def resampled_curves(curves: ActionUnitCurves, take: Take, gamma: float = GAMMA) -> Predicted:
-    """Curves of a video, frame by frame of a take that began when it did; shapes it never moves are left out."""
+def resampled_curves(curves: ActionUnitCurves, take: Take, gamma: float = GAMMA, offset: float = 0.0) -> Predicted:
+    """Curves of a video that began ``offset`` seconds after a take, frame by frame of it; shapes it never moves are
+    left out."""
     moved = curves.active.any(0)
     names = tuple(name for name, moves in zip(curves.names, moved.tolist(), strict=True) if moves)
     weights, active = curves.weights[:, moved], curves.active[:, moved]
+    rows, last = torch.arange(len(weights)), len(weights) - 1
+    at = (take.times - offset) * curves.fps  # in frames of the video
+    before, _ = frames_beside(rows, at)
+    early, late = at < -_ROUNDING, at > last + _ROUNDING
+    active_frames = (active[before] | active[(before + 1).clamp(max=last)]) & ~(early | late)[:, None]
     notes = []
     if abs(curves.fps - take.fps) > _SAME_RATE * take.fps:
         notes.append(f"video of {curves.fps:g} frames a second brought to the take's {take.fps:g}")
-    at = take.times * curves.fps
-    before = at.floor().long().clamp(max=len(weights) - 1)
-    after = (before + 1).clamp(max=len(weights) - 1)
-    fraction = (at - before).clamp(0, 1).to(weights)[:, None]
-    there = torch.lerp(weights[before], weights[after], fraction)
-    within = (at <= len(weights) - 1 + 1e-6)[:, None]
-    active_frames = (active[before] | active[after]) & within
-    if not bool(within.all()):
-        missing = int((~within).sum())
-        notes.append(f"the video ends {missing} frames before the take; there the markers are alone")
-    elif len(weights) - 1 - float(at[-1]) > 1.5:
-        notes.append(f"the video goes on for {len(weights) - 1 - float(at[-1]):.0f} frames after the take; left out")
-    notes.append("take and video are taken to begin together")
+    if bool(early.any()):
+        notes.append(f"the video begins {int(early.sum())} frames after the take; there the markers are alone")
+    if bool(late.any()):
+        notes.append(f"the video ends {int(late.sum())} frames before the take; there the markers are alone")
+    elif last - float(at[-1]) > 1.5:
+        notes.append(f"the video goes on for {last - float(at[-1]):.0f} frames after the take; left out")
+    if hidden := int((~curves.seen).any(1).sum()):
+        notes.append(f"{hidden} frames of the video do not show the paint of a region; there the markers are alone")
+    together = "take and video are taken to begin together"
+    notes.append(f"the video is taken to begin {offset:g} s after the take" if offset else together)
     weighed = gamma_curves(active_frames, gamma, max(round(_BLEND_SECONDS * take.fps), _MIN_BLEND_FRAMES))
-    return Predicted(Track(names, there[..., None]), Track(names, weighed[..., None]), tuple(notes))
+    values = values_at(weights, rows, at)
+    return Predicted(Track(names, values[..., None]), Track(names, weighed[..., None]), tuple(notes))
+
+
+def video_warnings(alone: Take, predicted: Predicted) -> list[str]:
+    """Whether the video's curves move as the weights of the markers alone; nothing where they do, or the markers show
+    no motion of these shapes."""
+    assert alone.weights is not None
+    own = alone.weights.select(predicted.weights.names).values[..., 0].double()
+    moves = torch.where(own.std(0) > _MOVES, own.std(0), 0.0)
+    if len(own) < 2 or not bool(moves.any()):
+        return []
+    led = torch.where(predicted.gamma.values > 0, predicted.weights.values, 0.0)[..., 0].double()
+    ours, theirs = (torch.nn.functional.normalize(values - values.mean(0), dim=0) for values in (led, own))
+    size = 2 * len(own)
+    spectrum = torch.fft.rfft(ours, size, dim=0).conj() * torch.fft.rfft(theirs, size, dim=0)
+    correlation = torch.fft.irfft(spectrum, size, dim=0) @ moves / moves.sum()  # by how many frames the video is early
+    if float(correlation[0]) > _AGREES:
+        return []
+    best = int(correlation.argmax())
+    seconds = (best if best < len(own) else best - size) / alone.fps
+    would = f" (by {float(correlation[best]):.2f} with `offset` in its labels {seconds:+.2f} s from now)"
+    return [
+        f"the video's curves and those of the markers alone correlate by {float(correlation[0]):.2f}"
+        + (would if float(correlation[best]) > _AGREES else "")
+        + f", expected more than {_AGREES}: is it a video of this take, from its beginning on, at its true rate? "
+        "Compare with a solve without it"
+    ]
 
 
 def _fitting_table(units: tuple[str, ...], names: tuple[str, ...]) -> str:

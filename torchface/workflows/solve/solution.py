@@ -26,7 +26,7 @@ from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
 from torchface.take import Take, Track, empty_frames
 from torchface.workflows.marker_input import scale_warnings
-from torchface.workflows.solve.head_camera import Predicted
+from torchface.workflows.solve.head_camera import Predicted, video_warnings
 from torchface.workflows.solve.take_check import (
     check_coverage,
     check_explained,
@@ -239,6 +239,7 @@ def solve_markers(
         steady, motion = _without_slip(rig, attachment, take, settings)
         solver = MarkerSolver(rig, attachment, sparsity=settings.sparsity, ridge=settings.ridge)
     if predicted is not None:
+        warnings += video_warnings(solver.solve_take(steady), predicted)
         solved = HybridSolver(solver).solve_take(steady, predicted.weights, predicted.gamma)
     else:
         solved = WholeTakeSolver(solver).solve_take(steady) if whole else solver.solve_take(steady)
