@@ -6,7 +6,7 @@ import gc
 import inspect
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from compileall import compile_file
 from contextlib import suppress
 from copy import copy, deepcopy
@@ -336,3 +336,21 @@ def chromium(started_chromium: Any) -> Iterator[Any]:
     yield started_chromium
     started_chromium.get("about:blank")
     started_chromium.set_window_size(600, 600)
+
+
+@pytest.fixture
+def messages_of(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
+    """Runs a command, which ends with ``status``; gives what it says on its error stream, its words a space apart."""
+    from torchface.cli import main
+
+    def run(*words: object, status: int = 0) -> str:
+        ended: object = 0
+        try:
+            main([str(word) for word in words])
+        except SystemExit as end:
+            ended = end.code or 0
+        printed = " ".join(capsys.readouterr().err.split())
+        assert ended == status, printed
+        return printed
+
+    return run

@@ -5,6 +5,7 @@ import json
 import os
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -133,12 +134,9 @@ def test_a_folder_of_results_is_compared_with_the_truths_of_their_names(
 
 
 @pytest.mark.bench  # each takes ten seconds
-def test_ranges_of_motion_give_an_attachment_each(
-    stage: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ranges_of_motion_give_an_attachment_each(stage: Path, tmp_path: Path, messages_of: Callable[..., str]) -> None:
     takes = [stage / "takes" / f"{name}.c3d" for name in NAMES]
     words = ("attach", stage / "rig.glb", *takes, "--initial", stage / "sites_{name}.json")
-    main([str(word) for word in (*words, "--out", tmp_path / "sites", "--insist")])
-    assert "2 of 2 takes attached" in " ".join(capsys.readouterr().err.split())
+    assert "2 of 2 takes attached" in messages_of(*words, "--out", tmp_path / "sites", "--insist")
     assert all(float(row["error_mm"]) < 0.2 for row in rows(tmp_path / "sites").values())
     assert Attachment.load(tmp_path / "sites" / "loud.json").labels

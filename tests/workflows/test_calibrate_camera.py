@@ -1,6 +1,6 @@
 """A planted camera comes back from pictures of a checkerboard, and useless images are refused by name."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import pytest
@@ -123,17 +123,16 @@ def test_corners_are_found_to_a_tenth_of_a_pixel(rays: Tensor, monkeypatch: pyte
     torch.testing.assert_close((big + 0.5) / 2 - 0.5, found, rtol=0, atol=0.3)
 
 
-def test_a_video_will_do(pictures: list[Tensor], tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_video_will_do(pictures: list[Tensor], tmp_path: Path, messages_of: Callable[..., str]) -> None:
     video = write_video(iter(pictures[:6]), tmp_path / "boards.avi", 10.0)
     out = tmp_path / "camera.toml"
-    main(["calibrate", str(video.path), "--corners", "7x5", "--out", str(out), "--quiet"])
-    assert "6 of 6 views used" in capsys.readouterr().err
+    assert "6 of 6 views used" in messages_of("calibrate", video.path, "--corners", "7x5", "--out", out, "--quiet")
     torch.testing.assert_close(load_calibration(out).intrinsics.diagonal(), K.diagonal(), rtol=0.01, atol=0)
 
 
 @pytest.mark.bench
 def test_two_cameras_are_put_where_they_are(
-    rays: Tensor, pictures: list[Tensor], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    rays: Tensor, pictures: list[Tensor], tmp_path: Path, messages_of: Callable[..., str]
 ) -> None:
     """The second one stands 60 mm to the right and is turned to the board."""
     turn, stand = rotation_matrix(torch.tensor([[0.0, 0.14, 0.01]]).double())[0], torch.tensor([60.0, 4, -5]).double()
@@ -147,8 +146,9 @@ def test_two_cameras_are_put_where_they_are(
         for name, shown in (("left", pictures), ("right", seen))
     ]
     out = tmp_path / "rig.toml"
-    main(["calibrate", films[0], "--beside", films[1], "--corners", "7x5", "--out", str(out), "--quiet"])
-    assert "right: 60." in capsys.readouterr().err
+    assert "right: 60." in messages_of(
+        "calibrate", films[0], "--beside", films[1], "--corners", "7x5", "--out", out, "--quiet"
+    )
     right = load_cameras(out)[1]
     assert right.name == "right"
     torch.testing.assert_close(right.rotation, turn, atol=6e-3, rtol=0)
@@ -181,11 +181,9 @@ def test_useless_pictures_are_refused(pictures: list[Tensor]) -> None:
         find_boards(iter([("a", pictures[0]), ("b", pictures[1][:, :600])]), BOARD, silent)
 
 
-def test_bad_words(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_words(tmp_path: Path, messages_of: Callable[..., str]) -> None:
     def refused(*words: str) -> str:
-        with pytest.raises(SystemExit):
-            main(["calibrate", *words, "--quiet"])
-        return " ".join(capsys.readouterr().err.split())
+        return messages_of("calibrate", *words, "--quiet", status=2)
 
     picture = str(save([torch.zeros(48, 64, dtype=torch.uint8)], tmp_path)[0])
     assert "expected columns x rows such as 9x6" in refused(picture, "--corners", "nine")

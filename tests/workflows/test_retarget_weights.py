@@ -1,6 +1,7 @@
 """``torchface retarget`` onto a rig whose mouthClose opens the jaw."""
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -60,32 +61,30 @@ def test_most_shapes_without_a_name_on_the_target_are_counted(tmp_path: Path) ->
 
 
 def test_action_units_of_openface_move_a_rig_and_those_without_a_shape_are_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, messages_of: Callable[..., str]
 ) -> None:
     rig = performer(texture=False).select(["jawOpen", "mouthSmileLeft", "mouthSmileRight"])
     save_rig(rig, tmp_path / "rig.glb")
     header = "frame, timestamp, confidence, success, x_0, y_0, AU12_r, AU25_r, AU26_r, AU26_c"
     (tmp_path / "film.csv").write_text(f"{header}\n1, 0, 1, 1, 10, 10, 3, 1, 5, 1\n2, 0.04, 1, 1, 10, 10, 0, 1, 0, 0\n")
     out = tmp_path / "out.csv"
-    main(["retarget", str(tmp_path / "film.csv"), "--to", str(tmp_path / "rig.glb"), "--out", str(out)])
-    said = " ".join(capsys.readouterr().err.split())
+    said = messages_of("retarget", tmp_path / "film.csv", "--to", tmp_path / "rig.glb", "--out", out)
     assert "3 of 3 shapes driven drives nothing: AU25_r" in said
     found = rig.weights_from(load_take(out).weights)
     torch.testing.assert_close(found, torch.tensor([[1.0, 0.6, 0.6], [0.0, 0.0, 0.0]]))
 
 
-def test_a_shape_without_motion_does_not_count_as_driven(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_shape_without_motion_does_not_count_as_driven(tmp_path: Path, messages_of: Callable[..., str]) -> None:
     rig = performer(texture=False).select(["jawOpen", "mouthSmileLeft", "mouthPucker"])
     deltas = rig.deltas * torch.tensor([1.0, 0.0, 1.0])[:, None, None]
     save_rig(BlendshapeRig(rig.neutral, deltas, rig.names), tmp_path / "rig.glb")
     save_take(Take(30.0, weights=Track(rig.names[:2], torch.ones(2, 2, 1))), tmp_path / "take.csv")
     words = ["retarget", tmp_path / "take.csv", "--to", tmp_path / "rig.glb", "--out", tmp_path / "out.csv"]
-    main([str(word) for word in words])
-    said = " ".join(capsys.readouterr().err.split())
+    said = messages_of(*words)
     assert "1 of 3 shapes driven nothing drives mouthPucker has no motion in the target: mouthSmileLeft" in said
 
 
-def test_an_identity_shape_is_not_spoken_of(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_identity_shape_is_not_spoken_of(tmp_path: Path, messages_of: Callable[..., str]) -> None:
     rig = performer(texture=False).select(["jawOpen"])
     names, deltas = ("Basis", "jawOpen", "thin"), torch.cat([0 * rig.deltas, rig.deltas, 0 * rig.deltas])
     save_rig(BlendshapeRig(rig.neutral, deltas, names), tmp_path / "rig.glb")
@@ -93,8 +92,7 @@ def test_an_identity_shape_is_not_spoken_of(tmp_path: Path, capsys: pytest.Captu
         weights = torch.tensor([float(name == "jawOpen") for name in known]).expand(2, -1)
         save_take(Take(30.0, weights=Track(known, weights[..., None])), tmp_path / "take.csv")
         words = ["retarget", tmp_path / "take.csv", "--to", tmp_path / "rig.glb", "--out", tmp_path / "out.csv"]
-        main([str(word) for word in words])
-        said = " ".join(capsys.readouterr().err.split())
+        said = messages_of(*words)
         assert "1 of 1 shapes driven" in said
         assert "Basis" not in said
         assert "thin" not in said
@@ -107,7 +105,7 @@ def test_names_that_nothing_knows_are_refused_with_the_flags_that_map_them(tmp_p
         retarget_weights(tmp_path / "mmd.csv", tmp_path / "rig.glb", WeightFiles(tmp_path / "out.csv"))
 
 
-def test_a_map_is_learned_from_poses_kept_and_drawn(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_map_is_learned_from_poses_kept_and_drawn(tmp_path: Path, messages_of: Callable[..., str]) -> None:
     whole = performer(texture=False)
     creature = whole.select(["jawOpen", "mouthPucker", "browInnerUp"])
     creature = BlendshapeRig(creature.neutral, creature.deltas, ("Maw", "Snout", "Horns"))
@@ -119,8 +117,7 @@ def test_a_map_is_learned_from_poses_kept_and_drawn(tmp_path: Path, capsys: pyte
         "[wonder]\nfrom = {browInnerUp = 1.0}\nto = {Horns = 0.7}\n"
     )
     take, rig, out = (str(tmp_path / name) for name in ("take.csv", "creature.glb", "out.csv"))
-    main(["retarget", take, "--to", rig, "--poses", str(tmp_path / "poses.toml"), "--out", out])
-    told = " ".join(capsys.readouterr().err.split())
+    told = messages_of("retarget", take, "--to", rig, "--poses", tmp_path / "poses.toml", "--out", out)
     assert "3 factors for 3 shapes from 2 poses, which they give within 0.000" in told
     found = load_take(out).weights
     expected = torch.stack([0.9 * weights[:, 0], 0.2 * weights[:, 0], 0.7 * weights[:, 1]], 1)
@@ -184,10 +181,8 @@ def test_what_an_unpacked_character_loses_is_said(tmp_path: Path) -> None:
 
 
 def test_weights_called_as_a_rig_are_refused_with_the_option_that_writes_one(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, messages_of: Callable[..., str]
 ) -> None:
     (tmp_path / "take.csv").touch()
     words = ["retarget", tmp_path / "take.csv", "--to", tmp_path, "--out", tmp_path / "hero_take.glb"]
-    with pytest.raises(SystemExit):
-        main([str(word) for word in words])
-    assert "the animated rig is written by --animation" in " ".join(capsys.readouterr().err.split())
+    assert "the animated rig is written by --animation" in messages_of(*words, status=2)

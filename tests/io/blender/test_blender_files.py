@@ -3,12 +3,12 @@
 import importlib.util
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 from rig_samples import sheet_rig
 
-from torchface.cli import main
 from torchface.errors import FileFormatError, MissingExtraError
 from torchface.io import save_rig
 from torchface.io.blender import read_blender_file, write_blender_file
@@ -32,14 +32,11 @@ def nothing(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("nothing")
-def test_without_blender_the_ways_to_have_it_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_without_blender_the_ways_to_have_it_are_named(tmp_path: Path, messages_of: Callable[..., str]) -> None:
     with pytest.raises(MissingExtraError, match=rf"neither bpy nor Blender.*pip install bpy.*{PROGRAM}"):
         read_blender_file(tmp_path / "rig.fbx")
     save_rig(sheet_rig(), tmp_path / "rig.glb")
-    with pytest.raises(SystemExit) as ended:
-        main(["convert", str(tmp_path / "rig.glb"), str(tmp_path / "rig.fbx")])
-    assert ended.value.code == 2
-    assert "neither bpy nor Blender" in " ".join(capsys.readouterr().err.split())
+    assert "neither bpy nor Blender" in messages_of("convert", tmp_path / "rig.glb", tmp_path / "rig.fbx", status=2)
 
 
 def test_the_program_that_is_named_runs(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -1,6 +1,7 @@
 """In Blender itself: our files open as they are meant, and Blender's own come back. ``make test-blender``."""
 
 import subprocess
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -93,11 +94,10 @@ def test_blenders_own_export_comes_back(
 
 
 def test_an_fbx_that_blender_made_becomes_a_glb(
-    actor: BlendshapeRig, take: Take, files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    actor: BlendshapeRig, take: Take, files: Path, tmp_path: Path, messages_of: Callable[..., str]
 ) -> None:
     in_blender("export", files / "actor.glb", tmp_path / "made.fbx")
-    main(["convert", str(tmp_path / "made.fbx"), str(tmp_path / "actor.glb")])
-    assert f"{len(actor.names)} shapes" in capsys.readouterr().err
+    assert f"{len(actor.names)} shapes" in messages_of("convert", tmp_path / "made.fbx", tmp_path / "actor.glb")
     found = load_rig(tmp_path / "actor.glb")
     assert found.names == actor.names
     assert farthest(motion(found), motion(actor)) < MILLIMETRES
@@ -140,12 +140,11 @@ def in_blenders_axes(places: torch.Tensor) -> np.ndarray:
 
 @pytest.mark.parametrize("ending", [".fbx", ".blend"])
 def test_correctives_play_in_blender_and_come_back(
-    ending: str, corrected: BlendshapeRig, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    ending: str, corrected: BlendshapeRig, tmp_path: Path, messages_of: Callable[..., str]
 ) -> None:
     values = 1.3 * torch.rand(6, 3, 1, generator=torch.Generator().manual_seed(2)) - 0.1
     save_animation(corrected, Take(FPS, weights=Track(corrected.names, values)), tmp_path / "sheet.usdc")
-    main(["convert", str(tmp_path / "sheet.usdc"), str(tmp_path / f"sheet{ending}")])
-    told = " ".join(capsys.readouterr().err.split())
+    told = messages_of("convert", tmp_path / "sheet.usdc", tmp_path / f"sheet{ending}")
     assert (".fbx has no correctives: the 4 are shape keys of their own" in told) == (ending == ".fbx")
     in_blender("show", tmp_path / f"sheet{ending}", tmp_path / "shown.npz", FPS)
     shown = np.load(tmp_path / "shown.npz")
@@ -218,12 +217,9 @@ def test_a_strangers_head_is_what_blender_shows(ending: str, strange: Path, tmp_
     assert cKDTree(shown.reshape(len(shown), -1)).query(places, p=np.inf)[0].max() < METRES
 
 
-def test_what_blender_cannot_read_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_what_blender_cannot_read_is_named(tmp_path: Path, messages_of: Callable[..., str]) -> None:
     (tmp_path / "broken.fbx").write_bytes(b"Kaydara FBX Binary  \x00\x1a\x00" + b"\xff" * 100)
-    with pytest.raises(SystemExit) as ended:
-        main(["convert", str(tmp_path / "broken.fbx"), str(tmp_path / "out.glb")])
-    assert ended.value.code == 2
-    told = " ".join(capsys.readouterr().err.split())
+    told = messages_of("convert", tmp_path / "broken.fbx", tmp_path / "out.glb", status=2)
     assert "broken.fbx" in told
     assert "Traceback" not in told
     assert not (tmp_path / "out.glb").exists()
