@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -9,8 +10,10 @@ from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Mesh, Take, Track, save_rig, save_take, zoo
 from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
+from torchface.progress import silent
 from torchface.synthetic import performer
 from torchface.synthetic.stages import place_markers
+from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
 
 FPS = 30.0
 FRAMES = 12
@@ -37,6 +40,10 @@ def folded(frames: Tensor, neutral: Tensor) -> Tensor:
     """Frames with folds across the face that deepen with the motion below them."""
     amount = (frames - neutral).norm(dim=-1, keepdim=True).clamp(max=6.0) / 6
     return frames + amount * 0.4 * torch.sin(neutral[:, 1:2]) * torch.tensor([0.0, 0.0, 1.0])
+
+
+def coarse(actor: Actor, path: Path, state: Path, **given: Any) -> Any:
+    return read_coarse(path, actor.mesh, InputSettings(**given), state, silent)
 
 
 @pytest.fixture(scope="package")

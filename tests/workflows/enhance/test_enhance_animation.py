@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 import torch
 
-from tests.workflows.enhance.conftest import FPS, FRAMES, Actor, folded
+from tests.workflows.enhance.conftest import FPS, FRAMES, Actor, coarse, folded
 from torchface import (
-    Attachment,
     BlendshapeRig,
     Mesh,
     Take,
@@ -34,7 +33,6 @@ from torchface.errors import (
     TopologyError,
     ValueRangeError,
 )
-from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import similarity_transform
 from torchface.io import Correspondences, MeshSequence, MeshSequenceWriter, load_image, save_correspondences
 from torchface.io.gltf.animation_reading import read_gltf_weights
@@ -43,7 +41,7 @@ from torchface.registration import Registration
 from torchface.rendering.clay_shading import sample_texture
 from torchface.workflows.animated_meshes import load_animated
 from torchface.workflows.enhance import enhance_views, enhanced_frames, head_correspondence
-from torchface.workflows.enhance.coarse_input import InputSettings, read_coarse
+from torchface.workflows.enhance.coarse_input import InputSettings
 from torchface.workflows.enhance.enhance_animation import EnhanceSettings, animation_targets, enhance_animation
 from torchface.workflows.enhance.enhance_page import write_enhance_page
 from torchface.workflows.marker_input import MarkerOptions
@@ -61,10 +59,6 @@ def written(path: Path, frames: torch.Tensor, faces: torch.Tensor) -> Path:
     with MeshSequenceWriter(path, len(frames), frames.shape[1], faces) as writer:
         writer.append(frames)
     return path
-
-
-def coarse(actor: Actor, path: Path, state: Path, **given: Any) -> Any:
-    return read_coarse(path, actor.mesh, InputSettings(**given), state, silent)
 
 
 def shuffled(actor: Actor) -> tuple[torch.Tensor, torch.Tensor]:
@@ -168,30 +162,6 @@ def test_uneven_times_are_brought_to_an_even_rate_and_said(actor: Actor, tmp_pat
             assert any(said in note for note in found.notes) == (name == "uneven")
             frames.append(found.read(0, FRAMES))
         torch.testing.assert_close(frames[0], frames[1], atol=2e-2, rtol=0)
-
-
-@pytest.mark.parametrize("freely", [False, True])
-def test_markers_in_any_place_move_the_face_as_the_rig_did(actor: Actor, tmp_path: Path, freely: bool) -> None:
-    phase = freely * torch.arange(FRAMES) / 2.0
-    turn = rotation_matrix(torch.tensor([0.1, 0.6, -0.2]) + 0.8 * torch.stack([phase.sin(), 0 * phase, 0 * phase], 1))
-    walked = torch.tensor([40.0, 1500.0, 7.0]) + 600 * torch.stack([0 * phase, 0 * phase, phase.sin()], 1)
-    points = actor.attachment.on(actor.mesh.faces, actor.frames)
-    points[2, 5:9] = torch.nan
-    points[6] = torch.nan
-    markers = Track(actor.attachment.labels or (), points @ turn.transpose(1, 2) + walked[:, None])
-    save_take(Take(FPS, markers=markers), tmp_path / "take.c3d")
-    given = {"attachment": actor.folder / "attachment.json", "rig": actor.folder / "rig.glb"}
-    rows = [t for t in range(FRAMES) if t != 6]
-    for own in ({**given, "neutral": 0}, {**given, "rig": None}):
-        found = coarse(actor, tmp_path / "take.c3d", tmp_path, **own)
-        moved, true = (actor.attachment.on(actor.mesh.faces, x)[rows] for x in (found.read(0, FRAMES), actor.frames))
-        laid = similarity_transform(moved, true, scale=False).apply(moved)
-        assert float((laid - true).norm(dim=-1).mean()) < 0.3
-        if not freely:
-            steps, wanted = (x[:, 1:6] - x[:, :5] for x in (found.read(0, 6)[None], actor.frames[None, :6]))
-            assert float((steps - wanted).norm(dim=-1).mean()) < 0.4 * float(wanted.norm(dim=-1).mean())
-        assert any("1 of 12 frames (the first 6) show fewer than 12 markers" in line for line in found.notes)
-        assert found.shown(2, 3)[0, 5:9].isnan().all()
 
 
 @pytest.mark.parametrize("ending", ["csv", "json"])
@@ -402,33 +372,6 @@ def test_what_does_not_fit_the_model_is_named(actor: Actor, tmp_path: Path) -> N
     other = written(tmp_path / "other.safetensors", actor.frames[:, order], shuffled(actor)[1])
     with pytest.raises(ShapeError, match="found 11 pairs, expected at least 12"):
         coarse(actor, other, tmp_path, pairs=few)
-
-
-def test_markers_that_do_not_fit_are_named(actor: Actor, tmp_path: Path) -> None:
-    points = actor.attachment.on(actor.mesh.faces, actor.frames)
-    take, sites = tmp_path / "take.trc", actor.folder / "attachment.json"
-    labels = actor.attachment.labels or ()
-    save_take(Take(FPS, markers=Track(labels, points)), take)
-    with pytest.raises(NameMismatchError, match=r"\(--attachment\)"):
-        coarse(actor, take, tmp_path)
-    eleven = tmp_path / "eleven.json"
-    actor.attachment.select(labels[:11]).save(eleven)
-    with pytest.raises(ShapeError, match="found 11 markers, expected at least 12"):
-        coarse(actor, take, tmp_path, attachment=eleven)
-    foreign = tmp_path / "foreign.json"
-    Attachment(actor.attachment.triangles, actor.attachment.barycentric, labels, None, "9-0123456789abcdef").save(
-        foreign
-    )
-    with pytest.raises(TopologyError, match=r"expected the model's.*\(--rig\)"):
-        coarse(actor, take, tmp_path, attachment=foreign)
-    large = tmp_path / "large.trc"
-    save_take(Take(FPS, markers=Track(labels, 10 * points)), large)
-    with pytest.raises(AlignmentError, match=r"10\.\d times too large.*--unit"):
-        coarse(actor, large, tmp_path, attachment=sites)
-    mixed = tmp_path / "mixed.trc"
-    save_take(Take(FPS, markers=Track(labels, points[:, torch.randperm(60)])), mixed)
-    with pytest.raises(AlignmentError):
-        coarse(actor, mixed, tmp_path, attachment=sites)
 
 
 def test_a_model_of_another_kind_is_named(tmp_path: Path) -> None:

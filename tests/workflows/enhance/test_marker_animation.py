@@ -1,0 +1,63 @@
+"""Markers as an animation of the model: in any place they move the face as the rig did; what does not fit is named."""
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from tests.workflows.enhance.conftest import FPS, FRAMES, Actor, coarse
+from torchface import Attachment, Take, Track, save_take
+from torchface.errors import AlignmentError, NameMismatchError, ShapeError, TopologyError
+from torchface.geometry.rotations import rotation_matrix
+from torchface.geometry.similarity import similarity_transform
+
+
+@pytest.mark.parametrize("freely", [False, True])
+def test_markers_in_any_place_move_the_face_as_the_rig_did(actor: Actor, tmp_path: Path, freely: bool) -> None:
+    phase = freely * torch.arange(FRAMES) / 2.0
+    turn = rotation_matrix(torch.tensor([0.1, 0.6, -0.2]) + 0.8 * torch.stack([phase.sin(), 0 * phase, 0 * phase], 1))
+    walked = torch.tensor([40.0, 1500.0, 7.0]) + 600 * torch.stack([0 * phase, 0 * phase, phase.sin()], 1)
+    points = actor.attachment.on(actor.mesh.faces, actor.frames)
+    points[2, 5:9] = torch.nan
+    points[6] = torch.nan
+    markers = Track(actor.attachment.labels or (), points @ turn.transpose(1, 2) + walked[:, None])
+    save_take(Take(FPS, markers=markers), tmp_path / "take.c3d")
+    given = {"attachment": actor.folder / "attachment.json", "rig": actor.folder / "rig.glb"}
+    rows = [t for t in range(FRAMES) if t != 6]
+    for own in ({**given, "neutral": 0}, {**given, "rig": None}):
+        found = coarse(actor, tmp_path / "take.c3d", tmp_path, **own)
+        moved, true = (actor.attachment.on(actor.mesh.faces, x)[rows] for x in (found.read(0, FRAMES), actor.frames))
+        laid = similarity_transform(moved, true, scale=False).apply(moved)
+        assert float((laid - true).norm(dim=-1).mean()) < 0.3
+        if not freely:
+            steps, wanted = (x[:, 1:6] - x[:, :5] for x in (found.read(0, 6)[None], actor.frames[None, :6]))
+            assert float((steps - wanted).norm(dim=-1).mean()) < 0.4 * float(wanted.norm(dim=-1).mean())
+        assert any("1 of 12 frames (the first 6) show fewer than 12 markers" in line for line in found.notes)
+        assert found.shown(2, 3)[0, 5:9].isnan().all()
+
+
+def test_markers_that_do_not_fit_are_named(actor: Actor, tmp_path: Path) -> None:
+    points = actor.attachment.on(actor.mesh.faces, actor.frames)
+    take, sites = tmp_path / "take.trc", actor.folder / "attachment.json"
+    labels = actor.attachment.labels or ()
+    save_take(Take(FPS, markers=Track(labels, points)), take)
+    with pytest.raises(NameMismatchError, match=r"\(--attachment\)"):
+        coarse(actor, take, tmp_path)
+    eleven = tmp_path / "eleven.json"
+    actor.attachment.select(labels[:11]).save(eleven)
+    with pytest.raises(ShapeError, match="found 11 markers, expected at least 12"):
+        coarse(actor, take, tmp_path, attachment=eleven)
+    foreign = tmp_path / "foreign.json"
+    Attachment(actor.attachment.triangles, actor.attachment.barycentric, labels, None, "9-0123456789abcdef").save(
+        foreign
+    )
+    with pytest.raises(TopologyError, match=r"expected the model's.*\(--rig\)"):
+        coarse(actor, take, tmp_path, attachment=foreign)
+    large = tmp_path / "large.trc"
+    save_take(Take(FPS, markers=Track(labels, 10 * points)), large)
+    with pytest.raises(AlignmentError, match=r"10\.\d times too large.*--unit"):
+        coarse(actor, large, tmp_path, attachment=sites)
+    mixed = tmp_path / "mixed.trc"
+    save_take(Take(FPS, markers=Track(labels, points[:, torch.randperm(60)])), mixed)
+    with pytest.raises(AlignmentError):
+        coarse(actor, mixed, tmp_path, attachment=sites)
