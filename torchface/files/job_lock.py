@@ -3,11 +3,14 @@
 import errno
 import os
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from contextvars import ContextVar
+from functools import wraps
+from inspect import signature
 from pathlib import Path
 from platform import node
+from typing import ParamSpec, TypeVar
 
 from filelock import FileLock, Timeout
 
@@ -18,6 +21,9 @@ from torchface.files.write_errors import unwritten
 
 LOCK = ".lock"
 _NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP)
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
+Lock = Callable[[str | Path], AbstractContextManager[Path]]
 _open_to_parts: ContextVar[frozenset[Path]] = ContextVar("open_to_parts", default=frozenset())
 
 
@@ -67,6 +73,20 @@ def within_job(folder: str | Path) -> Iterator[Path]:
             yield folder
         finally:
             _open_to_parts.reset(token)
+
+
+def holds_out(lock: Lock) -> Callable[[Callable[Given, Result]], Callable[Given, Result]]:
+    """Has a job hold what its argument ``out`` names while it works, by :func:`within_job` or :func:`file_lock`."""
+
+    def of_job(work: Callable[Given, Result]) -> Callable[Given, Result]:
+        @wraps(work)
+        def held(*given: Given.args, **named: Given.kwargs) -> Result:
+            with lock(signature(work).bind(*given, **named).arguments["out"]):
+                return work(*given, **named)
+
+        return held
+
+    return of_job
 
 
 @contextmanager

@@ -16,7 +16,7 @@ from torchface.capture import MarkerSolver, WholeTakeSolver
 from torchface.capture.markers import Observability, observability
 from torchface.errors import TopologyError, ValueRangeError
 from torchface.evaluation import MeshError, WeightError, marker_rmse, mesh_error, weight_error, weight_jitter
-from torchface.files.job_lock import within_job
+from torchface.files.job_lock import holds_out, within_job
 from torchface.io import (
     IdentityModes,
     load_identity_modes,
@@ -168,13 +168,10 @@ def _weight_take(path: Path) -> Take:
     return played
 
 
+@holds_out(within_job)
 def run_demo(scene: Scene, out: Path, seed: int = 0, progress: Progress | None = None) -> DemoResult:
     """Plays a scene and writes every file of the main job into a folder."""
-    with within_job(out):
-        return _run_demo(scene, out, seed, FLAWS, progress or silent)
-
-
-def _run_demo(scene: Scene, out: Path, seed: int, flaws: StageFlaws, progress: Progress) -> DemoResult:
+    progress = progress or silent
     files = {
         "template rig": out / "template.glb",
         "new head": out / "neutral.obj",
@@ -195,7 +192,7 @@ def _run_demo(scene: Scene, out: Path, seed: int, flaws: StageFlaws, progress: P
     attachment = (place_markers(scene.truth) if layout is None else layout.attachment).made_for(scene.head)
     attachment.save(files["marker sites"])
     generator = torch.Generator().manual_seed(seed)
-    recording = record(scene.truth, attachment, scene.weights, generator, flaws, scene.fps)
+    recording = record(scene.truth, attachment, scene.weights, generator, FLAWS, scene.fps)
     save_take(recording.take, files["marker take"])
     progress("solving the take", 0, 2)
     marker_solver = MarkerSolver(rig, attachment)
@@ -210,7 +207,7 @@ def _run_demo(scene: Scene, out: Path, seed: int, flaws: StageFlaws, progress: P
     (save_live_link if live else save_weights_csv)(solved, files["solved weights"])
     save_animation(rig, solved, files["animated rig"])
     some = recording.markers[:: max(1, len(recording.markers) // 300)]
-    seen = some + flaws.noise * torch.randn(some.shape, generator=generator)
+    seen = some + FLAWS.noise * torch.randn(some.shape, generator=generator)
     solver = export_marker_solver(marker_solver, files["solver for applications"], markers=seen, progress=progress)
     progress("comparing with the truth")
     face = face_mask(scene.head)

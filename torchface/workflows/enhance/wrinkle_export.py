@@ -16,7 +16,7 @@ from torchface.enhancement.wrinkle_maps.wrinkle_teaching import captured_poses, 
 from torchface.enhancement.wrinkle_maps.wrinkle_weights import RigWrinkles, WrinkleWeights
 from torchface.errors import FileFormatError, TopologyError, ValueRangeError
 from torchface.files.documents import write_json
-from torchface.files.job_lock import within_job
+from torchface.files.job_lock import holds_out, within_job
 from torchface.files.whole_files import make_folder
 from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.geometry.meshes.region_maps import RegionMaps
@@ -85,6 +85,7 @@ class ExportedWrinkles:
         ]
 
 
+@holds_out(within_job)
 def export_wrinkles(
     model_name: str,
     rig_path: Path,
@@ -96,13 +97,6 @@ def export_wrinkles(
     progress = silent if progress is None else progress
     checked_count("--maps", settings.maps, 1, MOST_MAPS)
     checked_count("--size", settings.size, *SIZES)
-    with within_job(out):
-        return _export(model_name, rig_path, out, settings, progress)
-
-
-def _export(
-    model_name: str, rig_path: Path, out: Path, settings: WrinkleSettings, progress: Progress
-) -> ExportedWrinkles:
     progress("reading model and rig")
     model = load_model(model_name)
     rig = load_rig(rig_path, part=settings.part)

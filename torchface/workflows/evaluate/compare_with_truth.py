@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.evaluation import ShapeErrors, region_figures, rigidly_aligned, shape_errors, vertex_errors
-from torchface.files.job_lock import within_job
+from torchface.files.job_lock import holds_out, within_job
 from torchface.files.whole_files import all_or_none
 from torchface.mesh import Annotations, Mesh
 from torchface.progress import Progress, silent
@@ -41,6 +41,7 @@ class EvaluationSettings:
     by_number: bool = False  # the first frame is compared with the first, and so on, whatever their times
 
 
+@holds_out(within_job)
 def evaluate(
     result: Path,
     truth: Path,
@@ -53,11 +54,7 @@ def evaluate(
     Writes ``regions.csv``, ``frames.csv``, ``shapes.csv`` where both have weights, and ``summary.json``;
     :func:`torchface.workflows.evaluate.evaluate_page.write_evaluation_page` makes the report.
     """
-    with within_job(out):
-        return _evaluate(result, truth, out, settings, progress or silent)
-
-
-def _evaluate(result: Path, truth: Path, out: Path, settings: EvaluationSettings, progress: Progress) -> Evaluation:
+    progress = progress or silent
     progress("reading result and truth")
     animated = load_animated(result, settings.rig, settings.part)
     true = load_animated(truth, settings.truth_rig or settings.rig, settings.part)

@@ -15,7 +15,7 @@ from torchface.errors import (
     TorchfaceError,
     ValueRangeError,
 )
-from torchface.files.job_lock import file_lock
+from torchface.files.job_lock import file_lock, holds_out
 from torchface.files.whole_files import all_or_none, check_writable, make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import load_mesh, load_rig, save_rig
@@ -95,6 +95,7 @@ class RigOptions:
     expressions: str | Path | None = None
 
 
+@holds_out(file_lock)
 def rig_actor(
     scan: Path,
     template: Path,
@@ -120,20 +121,7 @@ def rig_actor(
     check_out(out)
     if detail is not None and out.suffix.lower() == MAYA_ENDING:
         raise FileFormatError(f"{out}: found detail maps ({detail}) for a .ma file, expected .glb or USD for them")
-    with file_lock(out):
-        return _rig_actor(scan, template, out, landmarks, examples, detail, options or RigOptions(), progress or silent)
-
-
-def _rig_actor(
-    scan: Path,
-    template: Path,
-    out: Path,
-    landmarks: Path | None,
-    examples: Path | None,
-    detail: Path | None,
-    options: RigOptions,
-    progress: Progress,
-) -> ActorReport:
+    options, progress = options or RigOptions(), progress or silent
     progress("reading the template")
     rig = load_rig(template, part=options.part)
     shown = weights_row(options.pose, rig.names, "--pose") if options.pose else torch.zeros(len(rig.names))

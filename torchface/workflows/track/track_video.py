@@ -12,7 +12,7 @@ from torch import Tensor
 from torchface.capture.own_rig import FaceMeasurements
 from torchface.files.content_keys import content_key
 from torchface.files.documents import write_json
-from torchface.files.job_lock import within_job
+from torchface.files.job_lock import holds_out, within_job
 from torchface.files.whole_files import all_or_none
 from torchface.io import save_rig
 from torchface.landmarks.images.face_reading import FaceReading
@@ -23,7 +23,7 @@ from torchface.synthetic.head.embedded_character import is_performers
 from torchface.workflows.fit.fitted_character import dressed_rig
 from torchface.workflows.fit.video_pictures import sharpness_of
 from torchface.workflows.named_finders import part_finder
-from torchface.workflows.track.camera_views import OtherCamera, other_cameras
+from torchface.workflows.track.camera_views import other_cameras
 from torchface.workflows.track.frame_readings import read_frames
 from torchface.workflows.track.overlay_video import undistorted, write_overlay
 from torchface.workflows.track.person_head import PersonHead, person_head
@@ -59,6 +59,7 @@ from torchface.workflows.track.upright_rig import upright
 HEAD = "head.glb"
 
 
+@holds_out(within_job)
 def track_video(
     video: Path | None,
     rig: Path | None,
@@ -78,13 +79,8 @@ def track_video(
     and makes anew what depends on something that has changed.
     """
     progress = progress or silent
-    with within_job(out):
-        progress("reading the models; the first run makes their graphs, once")
-        inputs, others = other_cameras(load_inputs(video, rig, settings or TrackSettings()))
-        return _track(inputs, others, out, video is not None, progress)
-
-
-def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bool, progress: Progress) -> Tracked:
+    progress("reading the models; the first run makes their graphs, once")
+    inputs, others = other_cameras(load_inputs(video, rig, settings or TrackSettings()))
     state = TrackState(out, inputs.reading_key)
     seconds: dict[str, float] = {}
     pictures: dict[int, Tensor] = {}
@@ -102,7 +98,7 @@ def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bo
     if inputs.heads is not None:
         with _timed(seconds, "head"):
             head = person_head(inputs, inputs.heads, landmarks, reading, progress)
-        if filmed:
+        if video is not None:
             with _timed(seconds, "skin"):
                 head = with_filmed_skin(head, inputs, inputs.heads, reading, progress)
         inputs = replace(inputs, actor=head.rig)
@@ -155,7 +151,7 @@ def _track(inputs: TrackInputs, others: list[OtherCamera], out: Path, filmed: bo
             save_rig(tracked.shown, out / HEAD, head.surface)
     if head is not None and offsets is not None:  # other takes are tracked with the head's file
         replace(offsets, rig=rig_digest(upright(load_actor(out / HEAD, None))[0])).save(out / OFFSETS)
-    if filmed and inputs.settings.overlay != "none":
+    if video is not None and inputs.settings.overlay != "none":
         _add_overlay(tracked, out, state, key, progress)
     write_json(out / SUMMARY, summary(tracked))
     return tracked
