@@ -18,6 +18,25 @@ def test_arkit_has_52_names_and_its_mirror_is_an_involution() -> None:
         assert ARKIT[int(twin[i])] == expected
 
 
+@pytest.mark.parametrize(
+    ("left", "right"),
+    [
+        ("L_smile", "R_smile"),
+        ("lf_eye_blink", "rt_eye_blink"),
+        ("hero:bs.L_mouthSmile", "hero:bs.R_mouthSmile"),
+        ("SMILELEFT", "SMILERIGHT"),
+        ("smile.L", "smile.R"),
+        ("LeftEyeClosed", "RightEyeClosed"),
+        ("AU12L_inner", "AU12R_inner"),
+        ("Eye_L_Look_L", "Eye_R_Look_R"),
+        ("A14_Eye_Blink_Left", "A15_Eye_Blink_Right"),
+        ("facs_bs_MouthSmileLeft_div2", "facs_bs_MouthSmileRight_div2"),
+    ],
+)
+def test_sides_stand_anywhere_in_a_name(left: str, right: str) -> None:
+    assert mirror(["jaw", right, left, "∧", "AU12_r", "AU12_c", "roll"]).tolist() == [0, 2, 1, 3, 4, 5, 6]
+
+
 def test_live_link_spelling_is_a_permutation() -> None:
     shuffled = [name[0].upper() + name[1:] for name in reversed(ARKIT)]
     matrix = mapping(shuffled, ARKIT)

@@ -108,6 +108,10 @@ def test_every_cc4_name_is_the_one_it_says() -> None:
         ("Brow_Drop_L", "browDownLeft"),
         ("eye-blink.L", "eyeBlinkLeft"),
         ("facs_jnt_JawOpen", "jawOpen"),
+        ("lf_mouth_smile", "mouthSmileLeft"),
+        ("AU12_lipCornerPuller_R", "mouthSmileRight"),
+        ("AU26_jawDrop", "jawOpen"),
+        ("mouthSmile_L.001", "mouthSmileLeft"),
     ],
 )
 def test_names_of_other_programs(name: str, arkit: str) -> None:

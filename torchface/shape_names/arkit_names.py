@@ -143,13 +143,12 @@ def mirror(names: Sequence[str]) -> Tensor:
     """For each name the index of its mirror image, (N,) int64; a name without one is its own.
 
     Example:
-        >>> mirror(["jawOpen", "mouthSmileLeft", "mouthSmileRight", "jawLeft", "jawRight"]).tolist()
-        [0, 2, 1, 4, 3]
+        >>> mirror(["jawOpen", "mouthSmileLeft", "mouthSmileRight", "L_jaw", "rig.R_jaw", "rig.L_jaw"]).tolist()
+        [0, 2, 1, 3, 5, 4]
     """
-    row = {_canonical(name): i for i, name in enumerate(names)}
-    swapped = {"left": "right", "right": "left"}
-    twins = []
-    for i, name in enumerate(names):
-        twin = re.sub(r"(left|right)$", lambda side: swapped[side[1]], _canonical(name))
-        twins.append(row.get(twin, i))
-    return torch.tensor(twins, dtype=torch.int64)
+    words = [re.sub(r"^[ATat]\d\d_|(?<=[a-z0-9])(?=[A-Z])|[\s_.:|-]+", " ", name).lower() for name in names]
+    words = [re.sub(r"\b(?:l|lf|lt|left)\b|left$", "<", name) for name in words]
+    words = [re.sub(r"\b(?:r|rt|right)\b|right$", ">", name).replace(" ", "") for name in words]
+    row = {name: i for i, name in enumerate(words) if "<" in name or ">" in name}
+    swap = str.maketrans("<>", "><")
+    return torch.tensor([row.get(name.translate(swap), i) for i, name in enumerate(words)], dtype=torch.int64)

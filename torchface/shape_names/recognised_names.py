@@ -14,13 +14,13 @@ from torchface.shape_names.name_tables import METAHUMAN, VRM1
 from torchface.shape_names.pose_names import posed_weights
 
 _PREFIX = re.compile(
-    r"^(.*__(?=facs_)|.*(?=Fcl_)(?<!^)|.*[.:|](?=[^.:|]{3,}$)|(?:facs_)?(?:bs|jnt|ctrl|cbs)_|facs_|[at]\d\d_|arkit[_ ]|"
+    r"^(.*__(?=facs_)|.*(?=Fcl_)(?<!^)|.*[.:|](?=[^.:|]{3,}$)|(?:facs_)?(?:bs|jnt|ctrl|cbs)_|facs_|au\d+_(?=[a-z]{3})|[at]\d\d_|arkit[_ ]|"
     r"(?:head|face|blendshapes?|bs)\d*_(?=[a-z]))",
     re.IGNORECASE,
 )
 _SUFFIX = re.compile(r"(_div\d+|_hd\d*|\.\d{3})$", re.IGNORECASE)
 _WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
-_SIDE = {"l": "left", "r": "right", "lt": "left", "rt": "right"}
+_SIDE = {"l": "left", "r": "right", "lf": "left", "lt": "left", "rt": "right"}
 _ONE_SIDE = re.compile(r"[_.]([LR])$", re.IGNORECASE)
 _SHARED_PREFIX = re.compile(r"(?:(?!(?:l|r|left|right|fcl)[^a-z0-9])[a-z0-9]*[^a-z0-9])+", re.IGNORECASE)
 _SHARED_SUFFIX = re.compile(r"(?:[^a-z0-9](?!(?:l|r|left|right)(?![a-z0-9]))[a-z0-9]+)+$", re.IGNORECASE)
@@ -65,6 +65,7 @@ _GAZE = {
 """Names in which an eye's side and the way it looks are distinguished by their order."""
 
 _PLAIN = {
+    "jawOpen": ("Jaw_Drop",),
     "jawForward": ("Jaw_Fwd", "JawThrust", "Jaw_Front"),
     "mouthPucker": ("LipPucker", "Mouth_Pucker_All"),
     "mouthFunnel": ("LipFunneler",),
@@ -243,7 +244,7 @@ def _words(name: str) -> tuple[str, ...]:
     """The words of a name in lower case, sides written out; without what programs put around it."""
     previous = ""
     while previous != name:
-        previous, name = name, _SUFFIX.sub("", _PREFIX.sub("", name))
+        previous, name = name, _PREFIX.sub("", _SUFFIX.sub("", name))
     words = [word.lower() for word in _WORD.findall(name)]
     return tuple(_SPELLING.get(word, _SIDE.get(word, word)) for word in words)
 

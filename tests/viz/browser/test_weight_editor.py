@@ -37,6 +37,14 @@ def test_symmetric_edit_sets_the_twin_and_nothing_else() -> None:
     assert editor.pose.tolist() == [0.5, 0.25, 0.75, weights[0, 3]]
 
 
+def test_a_maya_rig_has_its_groups_and_twins_and_a_jaw_is_not_pulled_both_ways() -> None:
+    names = ("hero_bs.L_mouthSmile", "hero_bs.R_mouthSmile", "hero_bs.L_jaw", "hero_bs.R_jaw", "hero_bs.lf_eye_blink")
+    assert grouped(names) == {"eyes": [4], "jaw": [2, 3], "mouth": [0, 1]}
+    editor = WeightEditor(names, symmetric=True)
+    assert editor.set(names[1], 0.5) == names[:2]
+    assert editor.set(names[2], 0.5) == names[2:3]  # with its twin the face would stay where it is
+
+
 def test_an_edit_takes_its_neighbours_along_by_a_raised_cosine() -> None:
     editor = WeightEditor(NAMES, torch.full((21, 4), 0.25), spread=4)
     editor.frame = 10

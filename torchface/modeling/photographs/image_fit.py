@@ -259,7 +259,7 @@ def _in_place(rig: BlendshapeRig, mean: Tensor) -> Tensor:
 def _twins(names: Sequence[str]) -> Tensor:
     """Pairs (K,2) of shapes that mirror each other; eyes look to one side together, so their shapes are none."""
     twin = mirror(names)
-    first = [i for i, name in enumerate(names) if i < int(twin[i]) and not name.lower().startswith("eyelook")]
+    first = [i for i, name in enumerate(names) if i < int(twin[i]) and "look" not in name.lower()]
     return torch.stack([torch.tensor(first, dtype=torch.int64), twin[first]], dim=1)
 
 

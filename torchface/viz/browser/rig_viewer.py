@@ -15,7 +15,7 @@ from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import save_take
 from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
-from torchface.shape_names import mirror
+from torchface.shape_names import arkit_name, mirror
 from torchface.take import Take
 from torchface.viz.browser.browser_page import BrowserPage, SharedInput, frame_camera, icon
 from torchface.viz.browser.head_mesh import HeadOnPage
@@ -188,8 +188,9 @@ class RigViewer(BrowserPage):
         gui, editor = self.server.gui, self.editor
         low, high = editor.low.tolist(), editor.high.tolist()
         sliders: dict[str, SharedInput] = {}
-        for group, rows in grouped(self.rig.names).items():
-            with gui.add_folder(group.capitalize(), expand_by_default=group in _OPEN_GROUPS):
+        groups = grouped(self.rig.names)
+        for group, rows in groups.items():
+            with gui.add_folder(group.capitalize(), expand_by_default=group in _OPEN_GROUPS or len(groups) == 1):
                 for row in rows:
                     name = self.rig.names[row]
                     slider = gui.add_slider(label_of(name), low[row], high[row], 0.01, 0.0, hint=name)
@@ -251,7 +252,7 @@ def group_of(name: str) -> str:
         >>> [group_of(name) for name in ("browInnerUp_L", "EyeBlinkLeft", "tongueOut")]
         ['brows', 'eyes', 'other']
     """
-    lowered = name.lower()
+    lowered = (arkit_name(name) or name).lower()
     return next((group for prefix, group in _PREFIXES.items() if lowered.startswith(prefix)), "other")
 
 
@@ -278,6 +279,7 @@ def label_of(name: str) -> str:
         >>> [label_of(name) for name in ("mouthLowerDownRight", "browInnerUp_L", "jawLeft", "jawOpen", "tongueOut")]
         ['LowerDown R', 'InnerUp L', 'Left', 'Open', 'tongueOut']
     """
+    name = arkit_name(name) or name
     prefix = next((prefix for prefix in _PREFIXES if name.lower().startswith(prefix)), "")
     rest = name[len(prefix) :].lstrip("_") or name
     return re.sub(r"(?<=.)(?:_|(?<=[a-z])(?=[LR]))(L|R)(?:eft|ight)?$", r" \1", rest)

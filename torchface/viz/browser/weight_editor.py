@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
-from torchface.shape_names import mirror
+from torchface.shape_names import antagonists, arkit_name, mirror
 from torchface.take import Take, Track
 
 _FPS = 60.0
@@ -24,7 +24,8 @@ class WeightEditor:
 
     Args:
         spread: frames on each side that an edit takes along.
-        symmetric: an edit of a left shape sets its right twin to the same value, and the other way round.
+        symmetric: an edit of a left shape sets its right twin to the same value, and the other way round; not of one
+            that undoes it, such as ``jawLeft``.
     """
 
     def __init__(
@@ -44,7 +45,8 @@ class WeightEditor:
         self.low = start.amin(0).clamp(max=0.0)
         self.high = start.amax(0).clamp(min=1.0)
         self._loaded = start.clone()
-        self._twins = mirror(names).tolist()
+        opposed = antagonists([arkit_name(name) or name for name in names]).sort(1).values.tolist()  # jawLeft, jawRight
+        self._twins = [row if sorted([row, twin]) in opposed else twin for row, twin in enumerate(mirror(names).tolist())]
         self._frame = 0
 
     def __len__(self) -> int:
