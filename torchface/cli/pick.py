@@ -28,8 +28,9 @@ def pick(
     """Pick points on a head by clicking, in the browser: landmark vertices, marker sites, correspondences with a scan.
 
     Save writes into the folder OUT what has been picked: landmarks.json, annotated.glb (once every landmark is there),
-    attachment.json for the markers, correspondences.json for pairs. The page is at 127.0.0.1, no other machine can
-    open it, and none but who knows the whole address that is printed. Needs viser (torchface's extra `viewer`).
+    attachment.json for the markers, correspondences.json for pairs. Started again, it goes on with them. The page is at
+    127.0.0.1, no other machine can open it, and none but who knows the whole address that is printed. Needs viser
+    (torchface's extra `viewer`).
 
     Args:
         mesh: A mesh or rig: .glb, USD, .obj, .ply, .stl, .off, a folder of OBJ files, or ICT-FaceKit's FaceXModel

@@ -14,8 +14,8 @@ from torchface.shape_names.name_tables import METAHUMAN, VRM1
 from torchface.shape_names.pose_names import posed_weights
 
 _PREFIX = re.compile(
-    r"^(.*__(?=facs_)|.*(?=Fcl_)(?<!^)|.*[.:|](?=[^.:|]{3,}$)|(?:facs_)?(?:bs|jnt|ctrl|cbs)_|facs_|au\d+_(?=[a-z]{3})|[at]\d\d_|arkit[_ ]|"
-    r"(?:head|face|blendshapes?|bs)\d*_(?=[a-z]))",
+    r"^(.*__(?=facs_)|.*(?=Fcl_)(?<!^)|.*[.:|](?=[^.:|]{3,}$)|(?:facs_)?(?:bs|jnt|ctrl|cbs)_|facs_|[at]\d\d_|arkit[_ ]|"
+    r"au\d+_(?=[a-z]{3})|(?:head|face|blendshapes?|bs)\d*_(?=[a-z]))",
     re.IGNORECASE,
 )
 _SUFFIX = re.compile(r"(_div\d+|_hd\d*|\.\d{3})$", re.IGNORECASE)

@@ -4,11 +4,11 @@ import pytest
 import torch
 
 from torchface import Annotations, Attachment, BlendshapeRig, Mesh, load_mesh, load_rig
-from torchface.errors import ValueRangeError
+from torchface.errors import AlignmentError, NameMismatchError, TopologyError, ValueRangeError
 from torchface.io import load_correspondences, load_landmarks
 from torchface.viz.browser.landmark_sets import IBUG_68, THESIS_12, custom_set
 from torchface.viz.browser.pick_session import PickSession, SurfacePoint
-from torchface.viz.browser.picker import save_picks
+from torchface.viz.browser.picker import Picker, save_picks
 
 EARS = custom_set(["chin", "left ear", "right ear"])
 
@@ -106,6 +106,27 @@ def test_a_mirrored_landmark_sets_its_twin_to_the_mirrored_vertex(two_balls: Mes
     assert session.steps == 1  # both sides are one step
 
 
+def test_a_head_that_stands_aside_is_mirrored_about_its_own_middle(two_balls: Mesh) -> None:
+    aside = two_balls.vertices + torch.tensor([400.0, 1700.0, 0.0])
+    session = PickSession(two_balls.with_vertices(aside), landmark_set=EARS)
+    right = int(aside[:, 0].argmin())
+    ahead = torch.tensor([1.0, 0.001, 0.001])
+    session.pick_landmark(session.on_mesh(aside[right] - 100 * ahead, ahead), mirrored=True, row=2)
+    left = aside[session.picks.landmarks[1]] - aside[right]
+    torch.testing.assert_close(left, torch.stack([2 * (400 - aside[right, 0]), left[1] * 0, left[2] * 0]))
+    with pytest.raises(ValueRangeError, match="pairs need a scan"):
+        Picker(two_balls, mode="correspondences", port=0)
+    turned = PickSession(two_balls.with_vertices(two_balls.vertices[:, [2, 1, 0]]), landmark_set=EARS)
+    with pytest.raises(ValueRangeError, match="expected a head that looks along z"):
+        turned.pick_marker(turned.on_mesh(torch.tensor([300.0, 0.3, 0.3]), -ahead), mirrored=True)
+
+
+def test_names_of_landmarks_are_told_apart_before_the_first_is_picked() -> None:
+    for names in (["chin", "chin"], ["chin", ""], ["next"]):
+        with pytest.raises(NameMismatchError, match="expected each once"):
+            custom_set(names)
+
+
 @pytest.mark.parametrize("annotate", [False, True])
 def test_a_mirrored_marker_lies_at_the_mirror_image(two_balls: Mesh, annotate: bool) -> None:
     flipped = two_balls.vertices * torch.tensor([-1.0, 1.0, 1.0])
@@ -169,6 +190,18 @@ def test_everything_that_is_saved_comes_back(ball_rig: BlendshapeRig, tmp_path) 
     pairs = load_correspondences(tmp_path / "b" / "correspondences.json")
     assert pairs.vertices.tolist() == [7]
     torch.testing.assert_close(pairs.points[0].float(), mesh.vertices[8], atol=1e-3, rtol=0)
+    again = PickSession(mesh, mesh, EARS)
+    again.resume(tmp_path / "b")
+    assert again.picks == replace(session.picks, markers=again.picks.markers)
+    assert [label for label, _ in again.picks.markers] == ["CHEEK"]
+    torch.testing.assert_close(again.attachment().on(mesh.faces, mesh.vertices)[0], place, atol=1e-4, rtol=0)
+    assert [again.undo() for _ in range(3)] == [True, True, False]  # landmarks are moved, not taken back
+    with pytest.raises(NameMismatchError, match="found 'chin', expected 'ear'"):
+        PickSession(mesh, landmark_set=custom_set(["ear"])).resume(tmp_path / "b")
+    with pytest.raises(TopologyError):
+        PickSession(replace(mesh, faces=mesh.faces[1:], polygons=None), landmark_set=EARS).resume(tmp_path / "b")
+    with pytest.raises(AlignmentError, match="mm off the scan, expected its own"):
+        PickSession(mesh, mesh.with_vertices(1.1 * mesh.vertices), EARS).resume(tmp_path / "b")
     assert PickSession(rig.neutral, landmark_set=EARS).picks.landmarks == (5, 50, 60)  # and can be carried on
     save_picks(session, tmp_path / "c")
     assert load_mesh(tmp_path / "c" / "annotated.glb").landmarks.tolist() == [5, 50, 60]

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from torchface.errors import NameMismatchError
 from torchface.landmarks.images.ibug_68 import MIRROR_68
 
 
@@ -52,6 +53,8 @@ def custom_set(names: Sequence[str]) -> LandmarkSet:
         >>> custom_set(["chin", "left ear", "right ear"]).mirror
         (0, 2, 1)
     """
+    if len(set(names) - {"", "next"}) < len(names):
+        raise NameMismatchError(f"names: found {', '.join(map(repr, names))}, expected each once, none empty or 'next'")
     row = {name: i for i, name in enumerate(names)}
     swap = str.maketrans({"\0": "right", "\1": "left"})
     twins = (name.replace("left", "\0").replace("right", "\1").translate(swap) for name in names)

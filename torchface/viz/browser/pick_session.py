@@ -3,20 +3,24 @@
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import torch
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.errors import ValueRangeError
+from torchface.errors import AlignmentError, NameMismatchError, ValueRangeError
 from torchface.geometry.meshes.surface_index import SurfaceIndex
-from torchface.io.landmarks.picks import Correspondences, LandmarkVertices
+from torchface.geometry.meshes.unit_check import extent
+from torchface.io.landmarks.picks import Correspondences, LandmarkVertices, load_correspondences, load_landmarks
 from torchface.mesh import Mesh
 from torchface.rendering.raycast import RayCaster
 from torchface.viz.browser.landmark_sets import IBUG_68, LandmarkSet
 
 _MIDLINE = 1.0
+# Of the extent: a face is not this far from its mirror image, a head that is turned is.
+_FAR, _ITERATIONS, _ON_SCAN = 0.03, 10, 1e-4
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,35 @@ class PickSession:
         count = len(landmark_set.names)
         initial = (None,) * count if given is None or len(given) != count else tuple(given.tolist())
         self._history = [Picks(landmarks=initial)]
+
+    def resume(self, folder: Path) -> None:
+        """Goes on with what an earlier session saved in a folder; markers and pairs can be taken back one by one."""
+        mesh, names, picks = self.mesh, self.landmark_set.names, self.picks
+        if (path := folder / "landmarks.json").is_file():
+            saved = load_landmarks(path)
+            saved.check(mesh)
+            given = dict(zip(saved.labels, saved.vertices.tolist(), strict=True))
+            if others := [name for name in given if name not in names]:
+                raise NameMismatchError(f"{path}: found {others[0]!r}, expected {names[0]!r}, ...; give another --out")
+            landmarks = tuple(given.get(name, old) for name, old in zip(names, picks.landmarks, strict=True))
+            self._history = [replace(picks, landmarks=landmarks)]
+        if (path := folder / "attachment.json").is_file():
+            sites = Attachment.load(path)
+            sites.check(mesh, path)
+            sited = zip(sites.labels or (), sites.triangles.tolist(), sites.barycentric, strict=False)
+            for label, triangle, weights in sited:
+                self.pick_marker(_surface_point(mesh, triangle, weights), label)
+        if self.scan is not None and (path := folder / "correspondences.json").is_file():
+            pairs = load_correspondences(path)
+            pairs.check(mesh)
+            far = float(SurfaceIndex(self.scan.vertices, self.scan.faces).nearest(pairs.points).distance.max())
+            if far > _ON_SCAN * extent(self.scan.vertices):
+                raise AlignmentError(
+                    f"{path}: found pairs {far:.3g} mm off the scan, expected its own; give another --out"
+                )
+            points = map(tuple, pairs.points.tolist())
+            for pair in zip(pairs.labels, pairs.vertices.tolist(), points, strict=True):
+                self._history.append(replace(self.picks, pairs=(*self.picks.pairs, pair)))
 
     @property
     def picks(self) -> Picks:
@@ -92,7 +125,7 @@ class PickSession:
         landmarks[row] = point.vertex
         twin = self.landmark_set.mirror[row]
         if mirrored and twin != row:
-            landmarks[twin] = int(self.mirror[point.vertex])
+            landmarks[twin] = self.mirror_point(point).vertex
         self._history.append(replace(self.picks, landmarks=tuple(landmarks)))
         return row
 
@@ -126,24 +159,32 @@ class PickSession:
         self._history.append(replace(picks, pairs=pairs, waiting=None))
         return label
 
-    @cached_property
-    def mirror(self) -> Tensor:
-        """The vertex on the other side (V,): as annotated, else the one nearest to (-x, y, z)."""
-        if self.mesh.annotations is not None and self.mesh.annotations.mirror is not None:
-            return self.mesh.annotations.mirror
-        points = self.mesh.vertices.double()
-        nearest = cKDTree(points.numpy()).query((points * points.new_tensor([-1, 1, 1])).numpy())[1]
-        return torch.from_numpy(nearest).long()
-
     def mirror_point(self, point: SurfacePoint) -> SurfacePoint:
-        """The mirror image of a surface point, on the surface."""
-        if self.mesh.annotations is not None and self.mesh.annotations.mirror is not None:
-            corners = self.mirror[self.mesh.faces[point.triangle]]
+        """The mirror image of a surface point, on the surface: as annotated, else nearest to (2m-x, y, z)."""
+        mirror = None if self.mesh.annotations is None else self.mesh.annotations.mirror
+        if mirror is not None:
+            corners = mirror[self.mesh.faces[point.triangle]]
             image = torch.tensor(point.barycentric, dtype=torch.float64) @ self.mesh.vertices[corners].double()
         else:
-            image = torch.tensor(point.position, dtype=torch.float64) * torch.tensor([-1.0, 1.0, 1.0])
+            x, y, z = point.position
+            image = torch.tensor([2 * self._middle - x, y, z], dtype=torch.float64)
         nearest = self._index.nearest(image[None])
+        if float(nearest.distance[0]) > _FAR * extent(self.mesh.vertices):
+            raise ValueRangeError(
+                f"mirrored: found the surface {float(nearest.distance[0]):.3g} mm from the mirror image about "
+                f"x = {self._middle:.3g} mm, expected a head that looks along z; pick each side by itself"
+            )
         return _surface_point(self.mesh, int(nearest.triangle[0]), nearest.barycentric[0])
+
+    @cached_property
+    def _middle(self) -> float:
+        """Of the vertices along x: half-way, in the median, between each and the one nearest to its mirror image."""
+        points = self.mesh.vertices.double()
+        tree, middle = cKDTree(points.numpy()), float(points[:, 0].amin() + points[:, 0].amax()) / 2
+        for _ in range(_ITERATIONS):
+            images = points * points.new_tensor([-1, 1, 1]) + points.new_tensor([2 * middle, 0, 0])
+            middle = float((points[:, 0] + points[tree.query(images.numpy())[1], 0]).median()) / 2
+        return middle
 
     def landmarks(self) -> LandmarkVertices:
         """The landmarks picked so far."""

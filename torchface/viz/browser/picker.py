@@ -56,6 +56,10 @@ class Picker(BrowserPage):
         vertices = self.session.mesh.vertices
         self._normals = vertex_normals(vertices, self.session.mesh.faces).double()
         self._dot = _DOT * float(vertices.amax(0)[1] - vertices.amin(0)[1])
+        self.session.resume(self.out)
+        modes = MODES if scan is not None else MODES[:2]
+        if mode not in modes:
+            raise ValueRangeError(f"mode: found {mode!r}, expected {' or '.join(modes)}; pairs need a scan")
         super().__init__(label, port)
         self.head = HeadOnPage(self.server, self.session.mesh, "head")
         self.scan_offset = torch.zeros(3, dtype=torch.float64)
@@ -63,7 +67,7 @@ class Picker(BrowserPage):
             self.scan_offset = _beside(self.session.mesh.vertices, self.session.scan.vertices)
             self.scan_head = HeadOnPage(self.server, self.session.scan, "scan", tuple(self.scan_offset.tolist()))
         frame_camera(self.server, self.session.mesh, 1.0 if scan is None else 1.0 + _GAP)
-        self._add_panel(mode)
+        self._add_panel(mode, modes)
         self._dots: dict[str, viser.PointCloudHandle] = {}
         self._refresh("Click on the head.")
         self.server.scene.on_click()(self._clicked)
@@ -116,10 +120,9 @@ class Picker(BrowserPage):
         self._landmark.value = _NEXT
         return f"{names[row]}: vertex {point.vertex}."
 
-    def _add_panel(self, mode: str) -> None:
+    def _add_panel(self, mode: str, modes: tuple[str, ...]) -> None:
         gui = self.server.gui
         with gui.add_folder("Pick"):
-            modes = MODES if self.session.scan is not None else MODES[:2]
             self._mode: Any = gui.add_dropdown("Mode", modes, initial_value=mode)
             self._landmark: Any = gui.add_dropdown("Landmark", (_NEXT, *self.session.landmark_set.names))
             self._marker_label: Any = gui.add_text("Marker label", "", hint="Empty: marker000 and on")

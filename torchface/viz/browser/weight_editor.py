@@ -45,8 +45,9 @@ class WeightEditor:
         self.low = start.amin(0).clamp(max=0.0)
         self.high = start.amax(0).clamp(min=1.0)
         self._loaded = start.clone()
-        opposed = antagonists([arkit_name(name) or name for name in names]).sort(1).values.tolist()  # jawLeft, jawRight
-        self._twins = [row if sorted([row, twin]) in opposed else twin for row, twin in enumerate(mirror(names).tolist())]
+        opposed = antagonists([arkit_name(name) or name for name in names]).sort(1).values.tolist()
+        twins = enumerate(mirror(names).tolist())
+        self._twins = [row if sorted([row, twin]) in opposed else twin for row, twin in twins]
         self._frame = 0
 
     def __len__(self) -> int:
