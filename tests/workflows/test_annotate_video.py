@@ -160,8 +160,7 @@ def test_a_drag_takes_neighbours_along_and_is_one_step(video: Path, tracker: Tra
     moved = (session.landmarks - before)[:, 1]
     share = torch.exp(-(before - before[57]).square().sum(1) / 200)
     torch.testing.assert_close(moved, 6.0 * share)
-    assert session.steps == 1
-    assert session.undo()
+    assert [session.undo(), session.undo()] == [True, False]
     assert torch.equal(session.landmarks, before)
     session.grab(3)
     session.drag(torch.tensor([-50.0, 1e6]))  # the picture's border holds it
@@ -169,6 +168,11 @@ def test_a_drag_takes_neighbours_along_and_is_one_step(video: Path, tracker: Tra
     session.let_go()
     session.reset()
     assert torch.equal(session.landmarks, before)
+    states = [session.state]
+    session.save()
+    states.append(session.state)
+    session.undo()  # what was saved is no longer what is shown
+    assert [*states, session.state] == ["not saved", "saved", "changed since"]
     with pytest.raises(ValueRangeError, match="no landmark grabbed"):
         session.drag(before[0])
     with pytest.raises(ValueRangeError, match="landmark: found 68"):

@@ -103,7 +103,7 @@ def test_a_mirrored_landmark_sets_its_twin_to_the_mirrored_vertex(two_balls: Mes
     left = session.picks.landmarks[1]
     torch.testing.assert_close(two_balls.vertices[left], two_balls.vertices[right] * torch.tensor([-1.0, 1, 1]))
     assert session.picks.landmarks[0] is None
-    assert session.steps == 1  # both sides are one step
+    assert [session.undo(), session.undo()] == [True, False]  # both sides are one step
 
 
 def test_a_head_that_stands_aside_is_mirrored_about_its_own_middle(two_balls: Mesh) -> None:

@@ -20,6 +20,7 @@ class AnnotationSession:
         self.frames, self.folder = list(frames), Path(folder)
         self.saved = {frame.name for frame in frames} & set(saved)
         self._history = [[frame.landmarks.double().clone()] for frame in frames]
+        self._written = [frame.landmarks.double() for frame in frames]
         self._grabbed: tuple[int, Tensor] | None = None
         self.number = self._next_unsaved(-1) or 0
 
@@ -34,9 +35,10 @@ class AnnotationSession:
         return self._history[self.number][-1]
 
     @property
-    def steps(self) -> int:
-        """How many can be undone in this frame."""
-        return len(self._history[self.number]) - 1
+    def state(self) -> str:
+        """Whether the frame being corrected is saved as it stands, for people to read."""
+        changed = not torch.equal(self.landmarks, self._written[self.number])
+        return "not saved" if self.frame.name not in self.saved else "changed since" if changed else "saved"
 
     @property
     def extent(self) -> float:
@@ -83,10 +85,8 @@ class AnnotationSession:
     def undo(self) -> bool:
         """Takes this frame's last step back; false where there is none."""
         self._grabbed = None
-        if self.steps:
-            self._history[self.number].pop()
-            return True
-        return False
+        steps = self._history[self.number]
+        return len(steps) > 1 and steps.pop() is not None
 
     def reset(self) -> None:
         """Brings the landmarks back that the frame came with; can be undone."""
@@ -98,6 +98,7 @@ class AnnotationSession:
         frame = self.frame
         path = save_annotated_frame(AnnotatedFrame(frame.name, frame.image, self.landmarks), self.folder)
         self.saved.add(frame.name)
+        self._written[self.number] = self.landmarks
         return path
 
     def advance(self) -> bool:

@@ -165,8 +165,7 @@ class LandmarkEditor(BrowserPage):
             self._dots.batched_positions = self._places()
             self._dots.batched_colors = self._colors()
             self._lines.points = self._segments()
-            done = "saved" if session.frame.name in session.saved else "not saved"
-            counts = [("saved", f"{len(session.saved)} of {len(session.frames)}"), (session.frame.name, done)]
+            counts = [("saved", f"{len(session.saved)} of {len(session.frames)}"), (session.frame.name, session.state)]
             self._status.content = pick_list(counts, [])
             name = "Drag a dot, or click one to choose it." if self.chosen is None else IBUG_68.names[self.chosen]
             self._name.content = caption(name)

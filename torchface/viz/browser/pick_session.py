@@ -91,17 +91,9 @@ class PickSession:
         """As they stand."""
         return self._history[-1]
 
-    @property
-    def steps(self) -> int:
-        """How many can be undone."""
-        return len(self._history) - 1
-
     def undo(self) -> bool:
         """Takes the last step back; false where there is none."""
-        if self.steps:
-            self._history.pop()
-            return True
-        return False
+        return len(self._history) > 1 and self._history.pop() is not None
 
     @property
     def next_landmark(self) -> int | None:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.errors import TorchfaceError, ValueRangeError
+from torchface.errors import TopologyError, TorchfaceError, ValueRangeError
 from torchface.files.whole_files import all_or_none, made_folder
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io import save_correspondences, save_landmarks, save_mesh, save_rig
@@ -56,7 +56,10 @@ class Picker(BrowserPage):
         vertices = self.session.mesh.vertices
         self._normals = vertex_normals(vertices, self.session.mesh.faces).double()
         self._dot = _DOT * float(vertices.amax(0)[1] - vertices.amin(0)[1])
-        self.session.resume(self.out)
+        try:
+            self.session.resume(self.out)
+        except TopologyError as error:
+            raise TopologyError(f"{self.out}: {error}, or give another --out") from None
         modes = MODES if scan is not None else MODES[:2]
         if mode not in modes:
             raise ValueRangeError(f"mode: found {mode!r}, expected {' or '.join(modes)}; pairs need a scan")
