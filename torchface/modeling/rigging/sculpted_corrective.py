@@ -204,7 +204,7 @@ def checked_sculpt(path: object, sculpt: Mesh, rig: BlendshapeRig, shown: Tensor
         )
     size = extent(shown)
     check_unit(str(path), sculpt.vertices, size, "the rig", 0.5, 2.0)
-    motion = None if align == "keep" else _motion_of_the_whole(shown, sculpt.vertices)
+    motion = _motion_of_the_whole(shown, sculpt.vertices)
     placed = sculpt.vertices if motion is None else motion.apply(sculpt.vertices.double())[0]
     far = float((placed - shown.to(placed)).norm(dim=-1).median())
     if far > _FAR * size:
@@ -212,8 +212,8 @@ def checked_sculpt(path: object, sculpt: Mesh, rig: BlendshapeRig, shown: Tensor
             f"{path}: found half of the vertices {far:.3g} mm and more from where the rig shows them, expected a "
             "sculpt of this rig in its order of vertices"
         )
-    if motion is None or align == "remove":
-        return placed
+    if motion is None or align is not None:
+        return sculpt.vertices if align == "keep" else placed
     undone = motion.inverse()
     trace = float(undone.rotation[0].diagonal().sum())
     angle = torch.rad2deg(torch.acos(torch.tensor((trace - 1) / 2).clamp(-1, 1)))
