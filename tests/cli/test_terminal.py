@@ -6,6 +6,7 @@ import warnings
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
@@ -266,6 +267,27 @@ def test_numbers_that_make_no_sense_are_refused(
     assert words[-2].lstrip("-") in told
     assert "found" in told
     assert "expected" in told or "not known" in told
+
+
+def test_view_plays_takes_with_gaps_and_animated_rigs(
+    stage: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("viser")
+    shown = []
+
+    def serve(page: Any, line: str) -> None:
+        shown.append((page.editor.weights[:, page.rig.names.index("jawOpen")].tolist(), line))
+        page.stop()
+
+    monkeypatch.setattr(sys.modules["torchface.cli.view"], "serve_page", serve)
+    (tmp_path / "gap.csv").write_text("frame,time,jawOpen\n0,0,0.25\n1,0.1,\n2,0.2,0.75\n")
+    rig, out = str(stage / "rig.glb"), str(tmp_path / "out.csv")
+    main(["view", rig, str(tmp_path / "gap.csv"), "--port", "0", "--out", out])
+    animated = str(tmp_path / "animated.glb")
+    main(["retarget", str(tmp_path / "gap.csv"), "--to", rig, "--out", out, "--animation", animated])
+    main(["view", animated, animated, "--port", "0", "--out", out])
+    assert [weights for weights, _ in shown] == [pytest.approx([0.25, 0.5, 0.75])] * 2
+    assert [line[:29] for _, line in shown] == ["1 frames without a face take ", ""]
 
 
 @pytest.mark.parametrize("words", ["export --help", "--version", "--help"])

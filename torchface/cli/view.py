@@ -25,15 +25,16 @@ def view(
 
     Args:
         rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
-        weights: A weight take to play and edit, such as a Live Link Face CSV.
+        weights: A weight take to play and edit, such as a Live Link Face CSV or an animated .glb, RIG itself too.
         out: Where Save writes the weights: a .csv; if absent edited_weights.csv here, or beside the take.
         port: The first port to try.
     """
     from torchface.files.whole_files import check_ending, check_writable
-    from torchface.io import load_detail_maps, load_rig, load_take
+    from torchface.io import load_detail_maps, load_rig
     from torchface.io.rig_files import SCENE_ENDINGS
     from torchface.viz.browser.browser_page import HOST, free_port, import_viser
     from torchface.viz.browser.rig_viewer import RigViewer
+    from torchface.workflows.weight_files import filled, load_weight_take
 
     import_viser()  # what is missing should be said before a large rig is read
     free_port(HOST, port)
@@ -45,10 +46,11 @@ def view(
         progress("reading the rig")
         loaded = load_rig(rig, part=part)
         detail = load_detail_maps(rig) if rig.suffix.lower() in SCENE_ENDINGS else None
-        take = None
+        take, empty = None, 0
         if weights is not None:
             progress("reading the take")
-            take = load_take(weights)
+            take, empty = filled(load_weight_take(weights))
         progress("opening the page")
         viewer = RigViewer(loaded, take, out, detail, rig.stem, port)
-    serve_page(viewer)
+    gaps = f"{empty} frames without a face take what lies between their neighbours, saved too. " if empty else ""
+    serve_page(viewer, gaps)

@@ -163,10 +163,10 @@ def write_weights(
         warnings.append(f"{files.live_link} does not give back (halves are merged, others left out): {listed}")
     if files.animation is not None:
         make_folder(files.animation.parent)
-        filled, count = _filled(take)
+        whole, count = filled(take)
         if count:
             warnings.append(f"{files.animation}: {count} frames without a face take what lies between their neighbours")
-        reduced = write_animation(rig, filled, files.animation, files.reduce, source)
+        reduced = write_animation(rig, whole, files.animation, files.reduce, source)
         notes += [] if reduced is None else [f"{files.animation}: {reduced}"]
         if source is not None and source.suffix.lower() == ".gltf":
             warnings.append(
@@ -176,20 +176,20 @@ def write_weights(
     return warnings, notes
 
 
-def _filled(take: Take) -> tuple[Take, int]:
+def filled(take: Take) -> tuple[Take, int]:
     """A take whose frames without weights and rotations have those between the frames beside them, and their number."""
     assert take.weights is not None
     seen = torch.isfinite(take.weights.values).flatten(1).all(1).nonzero()[:, 0]
     if not 0 < len(seen) < len(take):
         return take, 0
 
-    def filled(values: Tensor) -> Tensor:
+    def between(values: Tensor) -> Tensor:
         return values_at(values[seen], take.times[seen], take.times)
 
     columns = take.extras.get("columns", {})
-    turns = {name: filled(column) for name, column in columns.items() if name in ROTATIONS}
+    turns = {name: between(column) for name, column in columns.items() if name in ROTATIONS}
     extras = take.extras | ({"columns": columns | turns} if turns else {})
-    weights = Track(take.weights.names, filled(take.weights.values))
+    weights = Track(take.weights.names, between(take.weights.values))
     return replace(take, weights=weights, extras=extras), len(take) - len(seen)
 
 
