@@ -30,6 +30,13 @@ def test_pose_by_words_and_by_take_is_the_rig_at_those_weights(dome_rig: Blendsh
     for take in ("take.csv", "take.glb"):
         by_take = load_posed(tmp_path / "rig.glb", {}, tmp_path / take, 3)
         torch.testing.assert_close(by_take.mesh.vertices, dome_rig(weights[3:4, :, 0])[0], atol=1e-3, rtol=0)
+        assert not by_take.faults
+    save_rig(dome_rig.select(["jawOpen"]), tmp_path / "jaw.glb")
+    fewer = load_posed(tmp_path / "jaw.glb", {}, tmp_path / "take.csv", 3)
+    lost = ", ".join(name for name in dome_rig.names if name != "jawOpen")
+    assert fewer.faults == (
+        f"warning: {tmp_path / 'jaw.glb'} has no shape for {lost}, which move in {tmp_path / 'take.csv'}",
+    )
     with pytest.raises(ValueRangeError, match="found no weights, expected a weight take"):
         load_posed(tmp_path / "rig.glb", {}, tmp_path / "rig.glb", 0)
 

@@ -7,7 +7,7 @@ from tyro.conf import Positional, arg
 
 from torchface.cli.command_options import OutputPath
 from torchface.cli.progress_bars import progress_bars
-from torchface.cli.terminal import Quiet, console, print_path
+from torchface.cli.terminal import Quiet, console, print_lines, print_path
 
 
 def render(
@@ -55,6 +55,7 @@ def render(
         colors = clay_colors(posed.mesh) if clay else None
         image = face_views(posed.mesh, yaw, colors, width=height * 4 // 5, height=height, framed_by=posed.neutral)
         save_rendered_image(image, out)
+    print_lines(posed.faults)
     if take is None and not weights and is_animated(path):
         console.print(
             f"{path} has an animation and is shown at rest; a frame of it: --take {path} --frame N",

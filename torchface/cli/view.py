@@ -6,7 +6,7 @@ from tyro.conf import Positional
 
 from torchface.cli.command_options import OptionalOutputPath, Part
 from torchface.cli.progress_bars import progress_bars
-from torchface.cli.terminal import Quiet, serve_page
+from torchface.cli.terminal import Quiet, print_lines, serve_page
 
 
 def view(
@@ -34,7 +34,7 @@ def view(
     from torchface.io.rig_files import SCENE_ENDINGS
     from torchface.viz.browser.browser_page import HOST, free_port, import_viser
     from torchface.viz.browser.rig_viewer import RigViewer
-    from torchface.workflows.weight_files import filled, load_weight_take
+    from torchface.workflows.weight_files import filled, load_weight_take, without_shape
 
     import_viser()  # what is missing should be said before a large rig is read
     free_port(HOST, port)
@@ -46,11 +46,13 @@ def view(
         progress("reading the rig")
         loaded = load_rig(rig, part=part)
         detail = load_detail_maps(rig) if rig.suffix.lower() in SCENE_ENDINGS else None
-        take, empty = None, 0
+        take, empty, faults = None, 0, []
         if weights is not None:
             progress("reading the take")
             take, empty = filled(load_weight_take(weights))
+            faults = [f"warning: {rig} {lost} {weights}" for lost in without_shape(loaded, take.weights)]
         progress("opening the page")
         viewer = RigViewer(loaded, take, out, detail, rig.stem, port)
+    print_lines(faults)
     gaps = f"{empty} frames without a face take what lies between their neighbours, saved too. " if empty else ""
     serve_page(viewer, gaps)

@@ -16,7 +16,7 @@ from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import Mesh, submesh
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping, near_names
-from torchface.workflows.weight_files import load_weight_take
+from torchface.workflows.weight_files import load_weight_take, without_shape
 
 _FEW, _ALIKE = 5, 0.5
 """Shapes that move a head; of the largest head's size, what another has at least."""
@@ -31,6 +31,7 @@ class Posed:
 
     mesh: Mesh
     neutral: Mesh
+    faults: tuple[str, ...] = ()  # what of a take is not shown, for people to read
 
 
 def pose_weights(words: Sequence[str], option: str = "--weights") -> dict[str, float]:
@@ -66,8 +67,9 @@ def load_posed(
     assert track is not None
     if not 0 <= frame < len(track):
         raise ValueRangeError(f"{take}: found {len(track)} frames, expected frame {frame} among them")
-    row = rig.weights_from(track.frames(slice(frame, frame + 1)))[0]
-    return Posed(rig.neutral.with_vertices(rig(row[None].to(rig.deltas))[0]), rig.neutral)
+    shown = track.frames(slice(frame, frame + 1))
+    mesh = rig.neutral.with_vertices(rig(rig.weights_from(shown).to(rig.deltas))[0])
+    return Posed(mesh, rig.neutral, tuple(f"warning: {path} {lost} {take}" for lost in without_shape(rig, shown)))
 
 
 def is_animated(path: Path) -> bool:

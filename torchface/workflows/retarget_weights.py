@@ -22,7 +22,7 @@ from torchface.io import load_rig
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
-from torchface.shape_names import arkit_sources, mapping
+from torchface.shape_names import arkit_sources
 from torchface.take import Take, Track
 from torchface.viz.figures.face_views import pose_pairs
 from torchface.workflows.posed_mesh import size_faults
@@ -31,6 +31,7 @@ from torchface.workflows.weight_files import (
     check_live_link,
     load_weight_take,
     weight_faults,
+    without_shape,
     write_weights,
 )
 
@@ -74,11 +75,7 @@ def retarget_weights(
     rig = None
     if source is not None:
         rig = load_rig(source)
-        moving = (played.weights.values[..., 0].nan_to_num() > 0).any(0)
-        known = mapping(played.weights.names, rig.names).any(0)
-        lost = [played.weights.names[row] for row in (moving & ~known).nonzero()[:, 0].tolist()]
-        if lost:
-            faults.append(f"{source} has no shape for {', '.join(lost)}, which move in {weights}")
+        faults += [f"{source} {lost} {weights}" for lost in without_shape(rig, played.weights)]
         # By the rig's own spelling, which is what a table names.
         played = replace(played, weights=Track(rig.names, rig.weights_from(played.weights)[..., None]))
     assert played.weights is not None

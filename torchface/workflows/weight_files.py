@@ -29,6 +29,7 @@ from torchface.workflows.head_rotations import still_head_columns
 
 _SHOWN = 8
 _KEPT = (".glb", ".vrm")  # rigs' files that are written again with all that they have
+_SEEN = 0.01  # of a weight: less moves nothing that is seen
 _ROUNDED = 1e-3  # what a file's rounding leaves beyond 0 or 1
 
 
@@ -72,6 +73,14 @@ def load_weight_take(path: Path) -> Take:
         )
     check_whole_frames(path, take.weights)
     return take
+
+
+def without_shape(rig: BlendshapeRig, weights: Track | None) -> list[str]:
+    """A warning, as the rest of a line, where shapes that move in weights (T,N,1) are none of a rig's."""
+    assert weights is not None
+    lost = (weights.values[..., 0].nan_to_num().abs() > _SEEN).any(0) & ~mapping(weights.names, rig.names).any(0)
+    names = [weights.names[row] for row in lost.nonzero()[:, 0].tolist()]
+    return [f"has no shape for {', '.join(names)}, which move in"] if names else []
 
 
 def check_whole_frames(path: Path, weights: Track) -> None:
