@@ -124,7 +124,8 @@ def corrective_from_sculpt(
         )
     drivers = tuple(rig.names[row] for row in rows)
     old = () if rig.correctives is None else rig.correctives.definitions
-    place = next((row for row, one in enumerate(old) if _acts_at(one, drivers, peak)), len(old))
+    acts = [set(one.drivers) == set(drivers) and abs((one.peak or 0.0) - (peak or 0.0)) < _SAME_PEAK for one in old]
+    place = [*acts, True].index(True)
     if place < len(old):
         if not replace:
             raise NameMismatchError(
@@ -153,12 +154,6 @@ def corrective_from_sculpt(
     return SculptedCorrective(
         BlendshapeRig(rig.neutral, rig.deltas, rig.names, made), definition, activation, change, more
     )
-
-
-def _acts_at(definition: Corrective, drivers: tuple[str, ...], peak: float | None) -> bool:
-    if set(definition.drivers) != set(drivers):
-        return False
-    return peak is None or abs((definition.peak or 0.0) - peak) < _SAME_PEAK
 
 
 def _motion_of_the_whole(shown: Tensor, sculpt: Tensor) -> Similarity | None:

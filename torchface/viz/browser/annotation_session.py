@@ -54,7 +54,8 @@ class AnnotationSession:
 
     def grab(self, row: int) -> None:
         """Takes hold of a landmark: what follows until it is let go is one step of undo."""
-        self._check(row)
+        if not 0 <= row < len(self.landmarks):
+            raise ValueRangeError(f"landmark: found {row}, expected 0 to {len(self.landmarks) - 1}")
         self._grabbed = (row, self.landmarks.clone())
         self._history[self.number].append(self.landmarks.clone())
 
@@ -112,7 +113,3 @@ class AnnotationSession:
         count = len(self.frames)
         order = [(after + 1 + i) % count for i in range(count)]
         return next((i for i in order if self.frames[i].name not in self.saved), None)
-
-    def _check(self, row: int) -> None:
-        if not 0 <= row < len(self.landmarks):
-            raise ValueRangeError(f"landmark: found {row}, expected 0 to {len(self.landmarks) - 1}")

@@ -93,11 +93,6 @@ class HeadOnPage:
             self._textured_nodes.append(node)
 
     @property
-    def vertices(self) -> Tensor:
-        """Where the page shows the vertices, (V,3), millimetres."""
-        return self._vertices
-
-    @property
     def has_texture(self) -> bool:
         """Whether the mesh brought a texture, vertex colours or wrinkle maps."""
         return self._textured is not None

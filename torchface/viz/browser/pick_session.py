@@ -52,6 +52,8 @@ class PickSession:
 
     def __init__(self, mesh: Mesh, scan: Mesh | None = None, landmark_set: LandmarkSet = IBUG_68) -> None:
         self.mesh, self.scan, self.landmark_set = mesh.to("cpu"), None if scan is None else scan.to("cpu"), landmark_set
+        self._mesh_caster = RayCaster(self.mesh.vertices, self.mesh.faces)
+        self._scan_caster = None if self.scan is None else RayCaster(self.scan.vertices, self.scan.faces)
         given = None if mesh.annotations is None else mesh.annotations.landmarks
         count = len(landmark_set.names)
         initial = (None,) * count if given is None or len(given) != count else tuple(given.tolist())
@@ -106,7 +108,9 @@ class PickSession:
 
     def on_scan(self, origin: Tensor, direction: Tensor) -> SurfacePoint | None:
         """Where a ray first meets the scan, in the scan's space."""
-        return None if self.scan is None else _first_hit(self._scan_caster, self.scan, origin, direction)
+        if self.scan is None or self._scan_caster is None:
+            return None
+        return _first_hit(self._scan_caster, self.scan, origin, direction)
 
     def pick_landmark(self, point: SurfacePoint, mirrored: bool = False, row: int | None = None) -> int:
         """Sets landmark ``row``, the next one if absent, to the vertex; mirrored its twin too. Returns the row."""
@@ -181,13 +185,11 @@ class PickSession:
     def landmarks(self) -> LandmarkVertices:
         """The landmarks picked so far."""
         rows = [row for row, vertex in enumerate(self.picks.landmarks) if vertex is not None]
-        _need(rows, "landmark")
         ids = torch.tensor([self.picks.landmarks[row] for row in rows], dtype=torch.int64)
         return LandmarkVertices(ids, tuple(self.landmark_set.names[row] for row in rows), self.mesh.fingerprint())
 
     def attachment(self) -> Attachment:
         """The marker sites."""
-        _need(self.picks.markers, "marker")
         triangles = torch.tensor([point.triangle for _, point in self.picks.markers], dtype=torch.int64)
         barycentric = torch.tensor([point.barycentric for _, point in self.picks.markers])
         labels = tuple(label for label, _ in self.picks.markers)
@@ -195,7 +197,6 @@ class PickSession:
 
     def correspondences(self) -> Correspondences:
         """The complete pairs."""
-        _need(self.picks.pairs, "correspondence")
         labels, vertices, points = zip(*self.picks.pairs, strict=True)
         values = torch.tensor(points, dtype=torch.float64)
         return Correspondences(torch.tensor(vertices), values, tuple(labels), self.mesh.fingerprint())
@@ -209,15 +210,6 @@ class PickSession:
             return labels
         free: Callable[[], str] = iter(n for i in range(10**6) if (n := f"marker{i:03d}") not in taken).__next__
         return tuple(free() for _ in range(count))
-
-    @cached_property
-    def _mesh_caster(self) -> RayCaster:
-        return RayCaster(self.mesh.vertices, self.mesh.faces)
-
-    @cached_property
-    def _scan_caster(self) -> RayCaster:
-        assert self.scan is not None
-        return RayCaster(self.scan.vertices, self.scan.faces)
 
     @cached_property
     def _index(self) -> SurfaceIndex:
@@ -242,8 +234,3 @@ def _surface_point(mesh: Mesh, triangle: int, barycentric: Tensor) -> SurfacePoi
     a, b, c = weights.tolist()
     x, y, z = position.tolist()
     return SurfacePoint(triangle, (a, b, c), (x, y, z), int(mesh.faces[triangle, nearest]))
-
-
-def _need(picked: object, what: str) -> None:
-    if not picked:
-        raise ValueRangeError(f"{what}s: found none picked, expected at least one")

@@ -1,6 +1,8 @@
 """The picking page: a click on the head, or on the scan beside it, becomes a landmark, a marker or a pair."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -221,43 +223,19 @@ def save_picks(session: PickSession, folder: str | Path, rig: BlendshapeRig | No
     picked = [vertex for vertex in picks.landmarks if vertex is not None]
     if not (picked or picks.markers or picks.pairs):
         raise ValueRangeError("picks: found none, expected a landmark, a marker or a correspondence to save")
-    with made_folder(folder), all_or_none():
-        return _write(session, folder, rig)
-
-
-def _write(session: PickSession, folder: Path, rig: BlendshapeRig | None) -> list[Path]:
-    picks, written = session.picks, list[Path]()
-    picked = [vertex for vertex in picks.landmarks if vertex is not None]
+    files: dict[str, Callable[[Path], object]] = {}
     if picked:
-        save_landmarks(session.landmarks(), folder / "landmarks.json")
-        written.append(folder / "landmarks.json")
+        files["landmarks.json"] = partial(save_landmarks, session.landmarks())
     if len(picked) == len(picks.landmarks):
-        _save_annotated(annotated(session), rig, folder / "annotated.glb")
-        written.append(folder / "annotated.glb")
+        notes = replace(session.mesh.annotations or Annotations(), landmarks=torch.tensor(picked, dtype=torch.int64))
+        mesh = replace(session.mesh, annotations=notes)
+        whole = None if rig is None else BlendshapeRig(mesh, rig.deltas.cpu(), rig.names, rig.correctives)
+        files["annotated.glb"] = partial(save_mesh, mesh) if whole is None else partial(save_rig, whole)
     if picks.markers:
-        session.attachment().save(folder / "attachment.json")
-        written.append(folder / "attachment.json")
+        files["attachment.json"] = session.attachment().save
     if picks.pairs:
-        save_correspondences(session.correspondences(), folder / "correspondences.json")
-        written.append(folder / "correspondences.json")
-    return written
-
-
-def annotated(session: PickSession) -> Mesh:
-    """The session's mesh with its landmarks as annotations, everything else kept."""
-    vertices = session.picks.landmarks
-    missing = [name for name, vertex in zip(session.landmark_set.names, vertices, strict=True) if vertex is None]
-    if missing:
-        raise ValueRangeError(
-            f"landmarks: found {len(vertices) - len(missing)} of {len(vertices)} picked, expected all; "
-            f"missing are {', '.join(missing[:5])}"
-        )
-    before = session.mesh.annotations or Annotations()
-    return replace(session.mesh, annotations=replace(before, landmarks=torch.tensor(vertices, dtype=torch.int64)))
-
-
-def _save_annotated(mesh: Mesh, rig: BlendshapeRig | None, path: Path) -> None:
-    if rig is None:
-        save_mesh(mesh, path)
-    else:
-        save_rig(BlendshapeRig(mesh, rig.deltas.cpu(), rig.names, rig.correctives), path)
+        files["correspondences.json"] = partial(save_correspondences, session.correspondences())
+    with made_folder(folder), all_or_none():
+        for name, write in files.items():
+            write(folder / name)
+    return [folder / name for name in files]

@@ -13,7 +13,6 @@ from torchface.errors import ValueRangeError
 from torchface.files.whole_files import make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import save_take
-from torchface.mesh import Mesh
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import arkit_name, mirror
 from torchface.take import Take
@@ -60,7 +59,8 @@ class RigViewer(BrowserPage):
         super().__init__(label, port)
         self._detail, self._wrinkled, self._rough, self._settled_at = detail, detail is not None, False, 0.0
         self._few_texels = None if detail is None else detail.reduced(_ROUGH_SIDE)
-        self.head = HeadOnPage(self.server, self._posed(), "head", normal_map=self._normal_map if detail else None)
+        posed = rig.neutral.with_vertices(self._vertices())
+        self.head = HeadOnPage(self.server, posed, "head", normal_map=self._normal_map if detail else None)
         frame_camera(self.server, rig.neutral)
         if self.take is not None:
             self._add_timeline()
@@ -91,9 +91,6 @@ class RigViewer(BrowserPage):
             make_folder(self.out.parent)
             save_take(self.editor.to_take(self.take), self.out)
         return self.out
-
-    def _posed(self) -> Mesh:
-        return self.rig.neutral.with_vertices(self._vertices())
 
     def _vertices(self) -> Tensor:
         return self.rig(self.editor.pose[None].to(self.rig.deltas))[0].detach()
@@ -146,7 +143,9 @@ class RigViewer(BrowserPage):
                 self.sliders[name].push(round(value, 3))
             if self.take is not None:
                 self._frame.push(self.editor.frame)
-                self._time.content = _time_line(self.editor.frame, len(self.editor), self.take)
+                code = "" if self.take.timecode is None else f" · {self.take.timecode[self.editor.frame]}"
+                seconds = float(self.take.times[self.editor.frame])
+                self._time.content = caption(f"{self.editor.frame} of {len(self.editor) - 1} · {seconds:.2f} s{code}")
 
     def _add_timeline(self) -> None:
         gui = self.server.gui
@@ -234,26 +233,10 @@ class RigViewer(BrowserPage):
             self._show()
 
 
-def _time_line(frame: int, frames: int, take: Take) -> str:
-    code = "" if take.timecode is None else f" · {take.timecode[frame]}"
-    return caption(f"{frame} of {frames - 1} · {float(take.times[frame]):.2f} s{code}")
-
-
 GROUPS = ("brows", "eyes", "jaw", "mouth", "cheeks", "nose", "other")
 """The field's groups, top of the panel first."""
 
 _PREFIXES = {"brow": "brows", "eye": "eyes", "jaw": "jaw", "mouth": "mouth", "cheek": "cheeks", "nose": "nose"}
-
-
-def group_of(name: str) -> str:
-    """The group of one shape.
-
-    Example:
-        >>> [group_of(name) for name in ("browInnerUp_L", "EyeBlinkLeft", "tongueOut")]
-        ['brows', 'eyes', 'other']
-    """
-    lowered = (arkit_name(name) or name).lower()
-    return next((group for prefix, group in _PREFIXES.items() if lowered.startswith(prefix)), "other")
 
 
 def grouped(names: Sequence[str]) -> dict[str, list[int]]:
@@ -268,7 +251,11 @@ def grouped(names: Sequence[str]) -> dict[str, list[int]]:
     for row, twin in enumerate(twins):
         order.setdefault(row)
         order.setdefault(twin)
-    members = {group: [row for row in order if group_of(names[row]) == group] for group in GROUPS}
+    lowered = [(arkit_name(name) or name).lower() for name in names]
+    called = [
+        next((group for prefix, group in _PREFIXES.items() if name.startswith(prefix)), "other") for name in lowered
+    ]
+    members = {group: [row for row in order if called[row] == group] for group in GROUPS}
     return {group: rows for group, rows in members.items() if rows}
 
 
