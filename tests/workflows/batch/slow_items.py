@@ -17,14 +17,6 @@ from torchface.workflows.batch.outcomes import Made
 WORDS = ItemKind("word", "spelled", (".txt",))
 
 
-class LastWords(str):
-    """Kills the process that reports it: in the middle of what it says, with whatever it holds for that."""
-
-    def __reduce__(self) -> str:
-        os.kill(os.getpid(), signal.SIGKILL)
-        return ""
-
-
 @dataclass(frozen=True)
 class SpellJob:
     """Writes a word backwards.
@@ -49,8 +41,6 @@ class SpellJob:
             raise ValueRangeError(f"{item.path}: found NaN, expected a word")
         if word == "odd":
             warnings.warn("an odd word", stacklevel=1)
-        if word == "last words":
-            return Made((item.path,), headline=LastWords(word))
         time.sleep(self.pause)
         result = out / item.name / "word.txt"
         result.parent.mkdir(exist_ok=True)

@@ -19,7 +19,7 @@ from torchface.errors import FileFormatError, ValueRangeError
 from torchface.workflows.batch import run_batch as module
 from torchface.workflows.batch.batch_items import BatchItem, ItemKind, check_for_each, find_items, is_batch
 from torchface.workflows.batch.outcomes import Outcome
-from torchface.workflows.batch.processes import _received, _Worker, in_processes
+from torchface.workflows.batch.processes import _received, _Worker
 from torchface.workflows.batch.run_batch import BatchOptions, BatchReport, run_batch
 
 TEXTS = {"anna": "anna", "bob": "robert", "cy": "odd", "nan": "nan"}
@@ -85,15 +85,6 @@ def test_one_that_dies_and_one_at_the_time_limit_take_no_other_along(words: Path
     mended = run(words, "shared")
     assert [outcome.name for outcome in mended.outcomes if not outcome.reused] == ["x", "y"]
     assert all(outcome.done for outcome in mended.outcomes if outcome.name != "nan")
-
-
-@pytest.mark.bench  # two processes load the library
-def test_a_process_that_dies_while_it_reports_holds_no_other_up(words: Path) -> None:
-    (words / "last.txt").write_text("last words")
-    items = [BatchItem("dies", words / "last.txt"), BatchItem("lives", words / "bob.txt")]
-    found = {outcome.name: outcome for outcome in in_processes(SpellJob(words.parent / "log"), items, words, 2)}
-    assert "signal 9" in found["dies"].error
-    assert found["lives"].done
 
 
 @pytest.mark.parametrize(
