@@ -67,6 +67,7 @@ def test_it_stops_where_the_residual_is_reached_and_not_before() -> None:
     wanted = box_qp(H, f)
     kept = ProjectedGradient(H, steps=1, tolerance=1e-6)(f, start=wanted)
     torch.testing.assert_close(kept, wanted, rtol=0, atol=1e-9)
+    assert ProjectedGradient(H, tolerance=1e-3)(f[:0]).shape == (0, H.shape[-1])
 
 
 @pytest.mark.parametrize("shape", [(), (5,)])

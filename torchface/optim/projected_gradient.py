@@ -171,13 +171,13 @@ class ProjectedGradient(nn.Module):
             back, moved = y - found, found - x
             age = torch.where(product(back * moved, weighed)[:, 0] > 0, 0.0, age)
             after = number + 1, found, found + (age / (age + 3))[:, None] * moved, age + 1
-            return after if self.tolerance is None else (*after, (back.abs() * eigenvalue[..., None]).max())
+            return after if self.tolerance is None else (*after, (back.abs() * eigenvalue[..., None]).amax(1))
 
         x = torch.minimum(torch.maximum(torch.zeros_like(f) if start is None else start, lower), upper)
         counted = torch.zeros((), dtype=torch.int64, device=f.device)
         # Of a column (B,1) torch.export may take the 1 for a size that varies, after a loop of other sizes.
         state: _State = (counted, x, x.clone(), torch.zeros_like(f[:, 0]))
-        state = state if self.tolerance is None else (*state, f.new_full((), torch.inf))
+        state = state if self.tolerance is None else (*state, torch.full_like(f[:, 0], torch.inf))
         return _looped(step, state, self.steps, self.tolerance)[1]
 
     @property
@@ -212,13 +212,13 @@ def _looped(step: Callable[..., _State], state: _State, steps: int, tolerance: f
     if is_recorded() and not torch.is_grad_enabled():
 
         def going(number: Tensor, *rest: Tensor) -> Tensor:
-            return number < steps if tolerance is None else (number < steps) & (rest[-1] > tolerance)
+            return number < steps if tolerance is None else (number < steps) & (rest[-1] > tolerance).any()
 
         found: _State = torch.while_loop(going, step, state)
         return found
     for _ in range(steps):  # each needs the one before
         state = step(*state)
-        if tolerance is not None and not is_transformed() and float(state[-1]) <= tolerance:
+        if tolerance is not None and not is_transformed() and not bool((state[-1] > tolerance).any()):
             break
     return state
 

@@ -220,6 +220,7 @@ def test_a_part_of_a_model_draws_the_same_heads(dome_rig: BlendshapeRig) -> None
     columns = (3 * ids[:, None] + torch.arange(3)).flatten()
     torch.testing.assert_close(cut.T @ cut, (whole.T @ whole)[columns][:, columns], rtol=0, atol=1e-6)
     torch.testing.assert_close(part.rig.deltas, dome_rig.deltas[:, ids])
+    assert torch.equal(model.part(keep).components, model.part(ids).components)
 
 
 def test_a_rig_travels_with_a_head_model(dome_rig: BlendshapeRig, tmp_path: Path) -> None:

@@ -43,6 +43,18 @@ def test_the_same_as_in_memory(values: torch.Tensor, monkeypatch: pytest.MonkeyP
     assert [done for done, _ in steps] == list(range(1, steps[-1][1] + 1))
 
 
+def test_samples_in_double_precision_are_left_as_they_are(
+    values: torch.Tensor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted, exact = MorphableModel.fit(values, 10), values.double()
+    monkeypatch.setattr(module, "_BLOCK_BYTES", 8 * 60 * 13)
+    for gram_samples in (module._GRAM_SAMPLES, 1):
+        monkeypatch.setattr(module, "_GRAM_SAMPLES", gram_samples)
+        found = MorphableModel.fit(exact, 10)
+        assert torch.equal(exact, values.double())
+        torch.testing.assert_close(found.standard_deviations, wanted.standard_deviations, rtol=1e-5, atol=0)
+
+
 def test_passes_give_the_same_as_in_memory_and_go_on_where_they_were(
     values: torch.Tensor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -267,12 +267,8 @@ class MorphableModel(nn.Module):
         modes = self.modes[:, vertices].double().flatten(1)
         _, deviations, components = torch.linalg.svd(modes, full_matrices=False)
         kept = deviations > 1e-6 * deviations[0].clamp(min=1e-12)
-        return MorphableModel(
-            self.mean[vertices],
-            components[kept].reshape(-1, len(vertices), self.mean.shape[1]),
-            deviations[kept],
-            samples=self.samples,
-        )
+        mean = self.mean[vertices]
+        return MorphableModel(mean, components[kept].unflatten(1, mean.shape), deviations[kept], samples=self.samples)
 
     @property
     def config(self) -> dict[str, Any]:

@@ -178,7 +178,7 @@ def _mean(
 
 
 def _centred(samples: Samples, begin: int, end: int, mean: Tensor) -> Tensor:
-    return samples.read(begin, end).flatten(1).double().sub_(mean)
+    return samples.read(begin, end).flatten(1) - mean
 
 
 class _Rows:

@@ -60,8 +60,8 @@ def fit_expressions(
     progress("solving for the coefficients")
     gram, product = torch.zeros(counts[0], counts[0]).double(), torch.zeros(counts).double()
     for begin, end in blocks(expressions):
-        X = flat.read(begin, end).flatten(1).double().sub_(neutral.mean)
-        Y = moving.read(begin, end).flatten(1).double().sub_(offset.mean)
+        X = flat.read(begin, end).flatten(1) - neutral.mean
+        Y = moving.read(begin, end).flatten(1) - offset.mean
         X = X @ model.neutral_components.flatten(1).double().T
         gram += X.T @ X
         product += X.T @ (Y @ model.offset_components.flatten(1).double().T)
