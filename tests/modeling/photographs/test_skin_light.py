@@ -23,6 +23,7 @@ from torchface.modeling.photographs.skin_light import (
     patch_offset,
     skin_light,
     unlit,
+    unveiled,
 )
 from torchface.modeling.photographs.skin_mask import FacePlaces
 from torchface.rendering.camera_visibility import PosedSurface
@@ -79,6 +80,16 @@ def test_hair_is_a_cap_of_its_colour_and_a_bald_head_stays_bald(head: Mesh, came
     assert float((cap[behind] - HAIR).norm(dim=1).median()) < 0.1  # no picture shows it
     forehead = places.cheeks & (places.place[:, 1] < 0.3) & ~part_vertices(head)
     assert float((cap[forehead] - SKIN).norm(dim=1).median()) < 0.1
+
+
+def test_highlights_are_not_the_hairs_colour(head: Mesh, camera: Camera) -> None:
+    haired = replace(head, colors=torch.where((FacePlaces.of(head).place[:, 1] > 0.55)[:, None], HAIR, head.colors))
+    picture = render(haired, camera, lighting=EVEN, samples=1)
+    parts = planted_parts(picture, {"hair": HAIR, "background": torch.zeros(3)}, 0.05)
+    shines = (parts.of("hair")[: picture.shape[1], : picture.shape[2]] > 0.5) & (torch.arange(300) % 8 == 0)
+    shining = torch.where(shines, 0.6, picture)
+    color = photographed_skin([head], None, [shining], [camera], FitSettings(texture_size=128, parts=[parts])).hair
+    assert float((color - HAIR).norm()) < 0.06  # their mean is 0.1 off
 
 
 def test_shadow_beside_hair_is_not_painted_and_a_mole_is(head: Mesh, camera: Camera) -> None:
@@ -215,6 +226,24 @@ def test_a_dark_complexion_stays_dark_before_a_dark_wall() -> None:
     assert gain(0.25, 0.6) == pytest.approx(1.0, abs=0.05)  # its eyes are as bright as in good light
     assert gain(0.35, 0.35) > 2.0  # fair in a dim picture: its eyes are dim too
     assert gain(0.25, 0.85) > 1.1  # brighter than any white beside that skin: light in glasses
+
+
+def test_a_veil_over_a_picture_is_taken_away() -> None:
+    skin, hair = torch.tensor([0.74, 0.56, 0.51]), torch.tensor([0.14, 0.11, 0.1])
+    picture = skin[:, None, None].expand(3, 60, 60).clone()
+    picture[:, :20], picture[:, 30:34, 10:18] = hair[:, None, None], 0.04  # hair, and a nostril
+
+    def cleared(veil: float, shown: Tensor = picture, tone: Tensor = hair) -> Tensor:
+        veiled = veil + (1 - veil) * shown
+        return unveiled(veiled, planted_parts(veiled, {"hair": veil + (1 - veil) * tone}, 0.02))
+
+    torch.testing.assert_close(cleared(0.0), picture, rtol=0, atol=0.005)  # redder than blue by 1.45
+    shares = [float(cleared(veil)[:, 5, 5].mean() / cleared(veil)[:, 50, 50].mean()) for veil in (0.0, 0.1, 0.25)]
+    assert shares[1:] == pytest.approx([shares[0]] * 2, abs=0.02)  # a quarter's veil alone makes it 0.41 of the skin
+    torch.testing.assert_close(cleared(0.25)[:, 50, 50].mean(), 0.25 + 0.75 * skin.mean(), rtol=0, atol=2e-3)
+    for kept in (picture.mean(0).expand(3, -1, -1), torch.where(picture < 0.2, 0.0, picture)):  # grey; black is there
+        parts = planted_parts(kept, {"hair": kept[:, 5, 5]}, 0.02)
+        torch.testing.assert_close(unveiled(kept, parts), kept, rtol=0, atol=2e-3)
 
 
 def test_blush_on_both_cheeks_stays_and_light_on_one_goes(head: Mesh) -> None:

@@ -26,7 +26,7 @@ _ABOVE_BROWS, _SQUARE, _HAIR = 0.06, 0.3, 0.5
 _DEEP, _SHARPLY = 5.0, 2  # pixels of the crop within hair, and the power with which they count
 _WHITE, _UNSURE = 0.1, 0.1  # of its brightness, by which the channels of white hair differ at most; its share
 _LEAST, _SHARE = 20, 0.3
-_DARKEST, _BLACK = 0.005, 0.07  # the share of a head's pixels that is black, and its usual value in photographs
+_MATT = 0.8  # share of hair without highlights
 _BEYOND, _MIDDLE = 0.2, 0.35  # share of hair in a picture above the brows, there about the face's middle
 # Of full white; shares: of hair in wide patches (leaves 0.53, hair at least 0.70), of what is green beside them.
 _GREEN, _PATCHY, _LEAFY = 0.008, 0.62, 0.2
@@ -153,7 +153,7 @@ def _hair_color(
     marks: Sequence[Tensor],
     on_head: bool,
 ) -> Tensor | None:
-    """The mean colour (3,) of hair above the brows, in its light and shade; None without.
+    """The mean colour (3,) of hair above the brows, in its light and shade but for highlights; None without.
 
     Where none is seen on the head that was found, it may stand off it, such as a shock of it.
     """
@@ -175,10 +175,15 @@ def _hair_color(
             weight = (
                 torch.from_numpy(cv2.distanceTransform(inside, cv2.DIST_L2, 3)).clamp(max=_DEEP).double().pow(_SHARPLY)
             )
-            colors.append(crop.double().flatten(1) @ weight.flatten())
-            weights.append(weight.sum())
-    total = torch.stack(weights).sum() if weights else torch.zeros(())
-    return (torch.stack(colors).sum(0) / total).float() if float(total) >= _LEAST else None
+            colors.append(crop.double().flatten(1))
+            weights.append(weight.flatten())
+    if not weights or float(torch.cat(weights).sum()) < _LEAST:
+        return None
+    color, weight = torch.cat(colors, dim=1), torch.cat(weights)
+    order = color.mean(0).argsort()
+    total = weight[order].cumsum(0)
+    matt = order[total <= _MATT * total[-1]]
+    return (color[:, matt] @ weight[matt] / weight[matt].sum()).float()
 
 
 def _white_hair(shown: FaceParts, crop: Tensor, head: Tensor) -> Tensor:
@@ -238,24 +243,6 @@ def _grown(shown: FaceParts, points: Tensor, share: Tensor) -> Tensor:
     names, counts = np.unique(over, return_counts=True)
     on_head = [name for name, count in zip(names, counts, strict=True) if name and count > _TUFT]
     return torch.from_numpy(cv2.dilate(np.isin(label, on_head).astype(np.uint8), np.ones((3, 3), np.uint8)))
-
-
-def without_veil(color: Tensor, skin: Tensor, images: Sequence[Tensor], heads: Sequence[Tensor]) -> Tensor:
-    """Hair's colour (3,), as dark beside skin's (3,) as in pictures that have black; films of webcams are washed
-    out."""
-    darkest = []
-    for image, head in zip(images, heads, strict=True):
-        size = torch.tensor(image.shape[:0:-1], dtype=head.dtype)
-        (left, top), (right, bottom) = (head.amin(0).floor().clamp(min=0).minimum(size - 3).long().tolist(),
-            head.amax(0).ceil().minimum(size).clamp(min=3).long().tolist())  # fmt: skip
-        shown = image[:3, top : max(bottom, top + 3), left : max(right, left + 3)]
-        smooth = torch.nn.functional.avg_pool2d(shown[None], 3, 1).mean(1).flatten()
-        darkest.append(smooth.kthvalue(1 + int(_DARKEST * (len(smooth) - 1))).values)
-    bright, dark = float(skin.mean()), float(color.mean())
-    veil = min(float(torch.stack(darkest).mean()) - _BLACK, 0.7 * dark)
-    if veil <= 0 or dark >= bright:
-        return color
-    return color * max(0.2, (bright - (bright - dark) * bright / (bright - veil)) / dark)
 
 
 def _usual_line() -> tuple[Tensor, Tensor]:

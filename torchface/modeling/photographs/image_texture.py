@@ -13,7 +13,7 @@ from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
 from torchface.modeling.photographs.eye_color import IRIS_WIDTH, iris_color
 from torchface.modeling.photographs.fit_settings import FitSettings
-from torchface.modeling.photographs.hair_cap import HairCap, hair_cap, without_veil
+from torchface.modeling.photographs.hair_cap import HairCap, hair_cap
 from torchface.modeling.photographs.landmark_view import LANDMARKS
 from torchface.modeling.photographs.skin_light import (
     exposed,
@@ -144,9 +144,6 @@ def photographed_skin(
             pixels = [view.camera.project(view.surface.vertices) for view in views]
             marks = [one[mesh.landmarks.cpu()] for one in pixels]
             cap = hair_cap(images, parts, pixels, marks, [view.shown for view in views], places, hair)
-            bare = torch.cat([view.shown.colors[view.parts.bare > _BARE] for view in views])
-            if cap is not None and len(bare):
-                cap = replace(cap, color=without_veil(cap.color, bare.median(0).values, images, pixels))
     own = base is None and bool(others.any()) and not bool(others.all())
     if own:
         confidence = torch.where(others, 0.0, torch.ones(count, len(others)) if confidence is None else confidence)
