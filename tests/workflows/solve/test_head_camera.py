@@ -1,5 +1,6 @@
 """Curves of a video, brought to the frames of a take."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,7 +10,10 @@ from torchface import Take, Track, zoo
 from torchface.capture.action_units import ActionUnitClassifier, ActionUnitCurves
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.io.action_labels import load_action_labels
+from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.solve.head_camera import HeadCamera, predicted_curves, resampled_curves, video_warnings
+from torchface.workflows.solve.solution import SolveSettings
+from torchface.workflows.solve.take_job import TakeJob
 
 
 def curves(frames: int, fps: float) -> ActionUnitCurves:
@@ -103,3 +107,17 @@ def test_regions_that_the_labels_lack_are_named_with_their_file(tmp_path: Path) 
     camera = HeadCamera(Path("take.mp4"), "action_units", less)
     with pytest.raises(NameMismatchError, match=r"less\.toml: regions: found no eye_left, eye_right, expected .*mouth"):
         predicted_curves(camera, take(2, 60.0), ("jawOpen",))
+
+
+def test_a_batch_solves_a_take_again_where_labels_or_classifier_have_changed(tmp_path: Path) -> None:
+    """Neither is named by a path of its own: labels lie beside the video, the classifier is a folder or a name."""
+    item = BatchItem("take", tmp_path / "take.c3d")
+    job = TakeJob(tmp_path / "rig.glb", tmp_path / "sites.json", SolveSettings())
+    job = replace(job, camera=HeadCamera(tmp_path / "{name}.mp4", str(tmp_path / "units")))
+    keys = [job.key(item)]
+    assert job.key(item) == keys[0]
+    for changed in ("take.toml", "units/model.toml"):
+        (tmp_path / changed).parent.mkdir(exist_ok=True)
+        (tmp_path / changed).write_text("changed")
+        keys.append(job.key(item))
+    assert len(set(keys)) == 3

@@ -35,6 +35,11 @@ class HeadCamera:
     units: tuple[str, ...] = ()  # those that count; all of the classifier's if empty
     gamma: float = GAMMA  # the largest weight of a prediction, mm² over all markers
 
+    @property
+    def labels_file(self) -> Path:
+        """Where the labels are."""
+        return self.labels or self.video.with_suffix(".toml")
+
 
 @dataclass(frozen=True, eq=False)
 class Predicted:
@@ -60,7 +65,7 @@ def predicted_curves(
     classifier = zoo.get_model(camera.classifier, ActionUnitClassifier)
     if unknown := [unit for unit in camera.units if unit not in classifier.units]:
         raise NameMismatchError(f"--units: found {', '.join(unknown)}, expected some of {', '.join(classifier.units)}")
-    where = camera.labels or camera.video.with_suffix(".toml")
+    where = camera.labels_file
     if not where.is_file():
         raise FileFormatError(
             f"{where}: found no such file, expected where helmet, markers and regions are in {camera.video.name}; "

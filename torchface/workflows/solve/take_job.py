@@ -1,12 +1,13 @@
 """One marker take of many, solved from file to file."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
 
 from torchface.files.content_keys import content_key
 from torchface.workflows.batch.batch_items import BatchItem
+from torchface.workflows.batch.batch_job import model_content
 from torchface.workflows.batch.contact_sheet import face_picture
 from torchface.workflows.batch.outcomes import RESULT, Made, word_of
 from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions
@@ -37,6 +38,9 @@ class TakeJob:
 
     def key(self, item: BatchItem) -> str:
         """A key of all that the take's weights depend on."""
+        camera = None if self.camera is None else item.settings_of(self.camera)
+        if camera is not None:
+            camera = replace(camera, labels=camera.labels_file, classifier=model_content(camera.classifier))
         return content_key(
             _METHOD,
             take=item.path,
@@ -44,7 +48,7 @@ class TakeJob:
             attachment=item.path_of(self.attachment),
             settings=self.settings,
             part=self.part,
-            camera=None if self.camera is None else item.settings_of(self.camera),
+            camera=camera,
             options=item.settings_of(self.options),
             written=[str(path) for path in (self.animation, self.report, self.live_link)],
             reduce=self.reduce,
