@@ -5,8 +5,15 @@ from dataclasses import replace
 import pytest
 import torch
 
-from torchface.capture.action_units import RegionVideo, read_regions
+from torchface.capture.action_units import (
+    ActionUnitClassifier,
+    RegionVideo,
+    action_unit_curves,
+    load_shape_table,
+    read_regions,
+)
 from torchface.capture.action_units.painted_regions import region_grid, sample_regions
+from torchface.capture.action_units.region_video import open_regions
 from torchface.errors import AlignmentError, FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.video import write_video
 from train.filmed_performers.camera_stage import RecordedSession
@@ -54,3 +61,19 @@ def test_a_film_of_dark_paint_has_the_same_pattern(session: RecordedSession, reg
     with pytest.warns(UserWarning, match=r"dark\.avi: the paint is taken to be darker than the skin"):
         found = read_regions(video, labels, regions.names, size=regions.neutral.shape[-1])
     assert (found.neutral - regions.neutral).abs().mean() < 0.02
+
+
+def test_a_film_is_classified_with_a_few_frames_in_memory_as_its_regions_are(
+    classifier: ActionUnitClassifier, regions: RegionVideo, session: RecordedSession
+) -> None:
+    film = open_regions(session.video, session.labels, regions.names, size=regions.neutral.shape[-1])
+    chunks = list(film.chunks())
+    assert max(map(len, chunks)) <= 64 < len(regions.patterns)
+    assert torch.equal(torch.cat(chunks), regions.patterns)
+    assert torch.equal(film.rest, regions.patterns[session.labels.neutral])
+    table, names = load_shape_table("arkit"), session.rig.names
+    of_film = action_unit_curves(classifier, session.video, session.labels, table, names)
+    reference = read_regions(session.video, session.labels, classifier.regions, classifier.neutral, classifier.size)
+    of_regions = action_unit_curves(classifier, reference, session.labels, table, names)
+    assert torch.equal(of_film.weights, of_regions.weights)
+    assert torch.equal(of_film.active, of_regions.active)

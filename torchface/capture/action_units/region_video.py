@@ -1,7 +1,7 @@
 """From a head-camera video to stabilised images of its painted regions."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -45,6 +45,21 @@ class RegionVideo:
     rest: Tensor
     fps: float
 
+    def chunks(self) -> Iterator[Tensor]:
+        """The patterns, some frames at a time."""
+        return iter(self.patterns.split(_CHUNK))
+
+
+@dataclass(frozen=True, eq=False)
+class RegionFilm:
+    """The painted regions of a video's file, read when they are wanted; fields as of :class:`RegionVideo`."""
+
+    names: tuple[str, ...]
+    neutral: Tensor
+    rest: Tensor
+    fps: float
+    chunks: Callable[[], Iterator[Tensor]]
+
 
 def read_regions(
     video: VideoFile | str | Path,
@@ -73,7 +88,20 @@ def read_regions(
         AlignmentError: helmet or markers cannot be followed.
         NameMismatchError: a region has no box.
     """
-    progress = progress or silent
+    film = open_regions(video, labels, names, reference, size, method, progress)
+    return RegionVideo(film.names, torch.cat(list(film.chunks())), film.neutral, film.rest, film.fps)
+
+
+def open_regions(
+    video: VideoFile | str | Path,
+    labels: ActionLabels,
+    names: Sequence[str],
+    reference: Tensor | None = None,
+    size: int = SIZE,
+    method: Method = "dis",
+    progress: Progress | None = None,
+) -> RegionFilm:
+    """What :func:`read_regions` reads, with a few frames in memory at a time."""
     video = video if isinstance(video, VideoFile) else open_video(video)
     grid = region_grid(labels.regions, names, size, video.width, video.height)
     _check_length(video, labels, video.count)
@@ -87,20 +115,22 @@ def read_regions(
     tracked = []
     try:
         tracker = PointTracker(still, torch.tensor(labels.helmet), torch.tensor(labels.markers))
-        for chunk in video.chunks(_CHUNK):  # once to follow the points, once to read: no whole video is in memory
+        for chunk in video.chunks(_CHUNK):
             tracked.append(tracker(chunk))
         _check_length(video, labels, sum(len(chunk) for chunk in tracked))
         transforms = steady_transforms(tracker.points, torch.cat(tracked))
     except AlignmentError as error:
         raise AlignmentError(f"{labels.source}: {error} ({video.path.name})") from None
-    patterns, done = [], 0
-    for chunk in islice(video.chunks(_CHUNK), len(tracked)):
-        regions = sample_regions(chunk.float() / 255, grid, transforms[done : done + len(chunk)])
-        patterns.append(levels.pattern(regions).half())
-        done += len(chunk)
-        progress(f"reading regions of {video.path.name}", done, labels.frames)
-    whole = torch.cat(patterns).float()
-    return RegionVideo(tuple(names), whole, neutral, whole[labels.neutral].clone(), video.fps)
+    rest = levels.pattern(sample_regions(still[None].float() / 255, grid, transforms[labels.neutral, None]))[0]
+
+    def chunks() -> Iterator[Tensor]:
+        done = 0
+        for chunk in islice(video.chunks(_CHUNK), len(tracked)):
+            yield levels.pattern(sample_regions(chunk.float() / 255, grid, transforms[done : done + len(chunk)]))
+            done += len(chunk)
+            (progress or silent)(f"reading regions of {video.path.name}", done, labels.frames)
+
+    return RegionFilm(tuple(names), neutral, rest, video.fps, chunks)
 
 
 def _identity() -> Tensor:

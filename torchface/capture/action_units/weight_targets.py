@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.action_units.classifier import ActionUnitClassifier
-from torchface.capture.action_units.region_video import RegionVideo, read_regions
+from torchface.capture.action_units.region_video import RegionFilm, RegionVideo, open_regions
 from torchface.capture.action_units.shape_table import ShapeTable
 from torchface.errors import NameMismatchError, ShapeError
 from torchface.io.action_labels import ActionLabels
@@ -21,7 +21,6 @@ WINDOWS: dict[str, int] = {"45": 15, "7": 21, "6+43": 21, "18L": 29, "18R": 29} 
 
 _RATE = 60.0
 _MIN_WINDOW = 5
-_CHUNK = 256
 _LEAST_PAINT, _MOST_PAINT = 0.4, 3.0  # beside that at rest; expressions show 0.7 to 1.8 of it
 
 
@@ -108,29 +107,23 @@ def action_unit_curves(
     whole = matrix = table.matrix(classifier.units, names)
     if units is not None:
         matrix = whole * torch.tensor([[float(unit in units)] for unit in classifier.units])
-    if not isinstance(video, RegionVideo):
-        video = read_regions(video, labels, classifier.regions, classifier.neutral, classifier.size, progress=progress)
-    seen = _paint_seen(classifier, video)
+    read = (
+        video
+        if isinstance(video, RegionVideo)
+        else open_regions(video, labels, classifier.regions, classifier.neutral, classifier.size, progress=progress)
+    )
+    levels, seen = _levels_and_paint(classifier, read)
     # What is before the lens for a while is no expression; the curve goes on over it.
-    levels = classify(classifier, video) * seen
     for unit, shown in enumerate(seen.T):
         levels[:, unit] = interpolated(levels[shown, unit], shown.nonzero()[:, 0], len(levels)) if shown.any() else 0.0
-    intensities = smooth_intensities(levels, classifier.units, settings.windows, fps=video.fps)
+    intensities = smooth_intensities(levels, classifier.units, settings.windows, fps=read.fps)
     weights = (intensities[:, :, None] * matrix).amax(1)
     active = _moved(levels, matrix)
     if settings.at_rest:
         active |= (matrix > 0).any(0) & ~_moved(levels, whole)
     active &= ~_moved(~seen, matrix)
     weights = weights.clamp(0, 1)
-    return ActionUnitCurves(tuple(names), weights, active, classifier.units, intensities, levels, video.fps, seen)
-
-
-def _paint_seen(classifier: ActionUnitClassifier, video: RegionVideo) -> Tensor:
-    """Whether the regions of each unit show about as much paint as at rest, (T,A) bool."""
-    share = video.patterns.mean((2, 3)) / video.rest.mean((1, 2))
-    seen = dict(zip(video.names, ((share > _LEAST_PAINT) & (share < _MOST_PAINT)).T, strict=True))
-    shown = {unit: group.regions for group in classifier.groups for unit in group.units}
-    return torch.stack([torch.stack([seen[name] for name in shown[unit]]).all(0) for unit in classifier.units], 1)
+    return ActionUnitCurves(tuple(names), weights, active, classifier.units, intensities, levels, read.fps, seen)
 
 
 def smooth_intensities(
@@ -153,9 +146,21 @@ def _moved(levels: Tensor, matrix: Tensor) -> Tensor:
     return (levels > 0).to(matrix) @ (matrix > 0).to(matrix) > 0
 
 
-@torch.no_grad()
 def classify(classifier: ActionUnitClassifier, video: RegionVideo) -> Tensor:
     """Levels of intensity (T,A), every frame on its own."""
+    return _levels_and_paint(classifier, video)[0]
+
+
+@torch.no_grad()
+def _levels_and_paint(classifier: ActionUnitClassifier, video: RegionVideo | RegionFilm) -> tuple[Tensor, Tensor]:
+    """Levels of intensity, and whether the regions of each unit show about as much paint as at rest, (T,A) both."""
     rows = [video.names.index(name) for name in classifier.regions]
-    rest = video.rest[rows]
-    return torch.cat([classifier(chunk[:, rows], rest) for chunk in video.patterns.split(_CHUNK)])
+    rest, levels, shares = video.rest[rows], [], []
+    for chunk in video.chunks():
+        levels.append(classifier(chunk[:, rows], rest))
+        shares.append(chunk[:, rows].mean((2, 3)) / rest.mean((1, 2)))
+    share = torch.cat(shares)
+    seen = (share > _LEAST_PAINT) & (share < _MOST_PAINT)
+    of_units = [group.regions for group in classifier.groups for _ in group.units]
+    shown = torch.tensor([[name in regions for regions in of_units] for name in classifier.regions]).float()
+    return torch.cat(levels), ~_moved(~seen, shown)
