@@ -1,5 +1,6 @@
 """The command solves markers with a video: what the markers hardly see comes from the painted patterns."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -8,6 +9,7 @@ from torchface import load_take, save_rig, zoo
 from torchface.capture.action_units import ActionUnitClassifier
 from torchface.cli import main
 from train.filmed_performers.camera_stage import RecordedSession
+from train.filmed_performers.label_files import save_action_labels
 
 
 def test_the_video_leads_what_markers_hardly_see(
@@ -37,6 +39,10 @@ def test_the_video_leads_what_markers_hardly_see(
     led = session.rig.index(["noseSneerLeft", "noseSneerRight", "cheekSquintLeft", "cheekSquintRight"])
     alone, hybrid = errors
     assert float(hybrid[led].mean()) < 0.7 * float(alone[led].mean())
+    save_action_labels(replace(session.labels, offset=1.0), tmp_path / "moved.toml")
+    moved = ["--video", str(session.video.path), "--video-labels", str(tmp_path / "moved.toml")]
+    main([*words, *moved, "--action-units", str(tmp_path / "units"), "--out", str(tmp_path / "w.csv"), "--quiet"])
+    assert "with `offset` in its labels -1.0" in " ".join(capsys.readouterr().err.split())
     with pytest.raises(SystemExit):
         main([*words, "--video", str(session.video.path), "--out", str(tmp_path / "w.csv"), "--quiet"])
     assert "expected both or neither" in " ".join(capsys.readouterr().err.split())

@@ -206,7 +206,8 @@ def solve_markers(
         take = _moved(raw, alignment.apply)
     solver = MarkerSolver(rig, attachment, sparsity=settings.sparsity, ridge=settings.ridge)
     fit = check_explained(solver, take, alignment is not None, settings.slip, settings.insist)
-    warnings += fit_warnings(fit, alignment is not None, settings.slip)
+    doubts = fit_warnings(fit, alignment is not None, settings.slip)
+    warnings += doubts
     warnings += _empty_frame_warnings(take)
     if settings.neutral is not None:
         warnings += neutral_warnings(rig, attachment, raw, settings.neutral, settings.free_scale)
@@ -239,7 +240,8 @@ def solve_markers(
         steady, motion = _without_slip(rig, attachment, take, settings)
         solver = MarkerSolver(rig, attachment, sparsity=settings.sparsity, ridge=settings.ridge)
     if predicted is not None:
-        warnings += video_warnings(solver.solve_take(steady), predicted)
+        if not doubts:  # weights that are wrong themselves say nothing of a video
+            warnings += video_warnings(solver.solve_take(steady), predicted)
         solved = HybridSolver(solver).solve_take(steady, predicted.weights, predicted.gamma)
     else:
         solved = WholeTakeSolver(solver).solve_take(steady) if whole else solver.solve_take(steady)
