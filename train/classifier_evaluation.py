@@ -49,13 +49,13 @@ def cross_validation(
     scores = {}
     for group in groups:
         own = patterns[:, [names.index(name) for name in group.regions]]
-        labelled = label_group(own, labels, group, settings)
+        _, classes = label_group(own, labels, group, settings)
         still = rest[:, [names.index(name) for name in group.regions]]
         samples = group_features(GroupClassifier(group, own.shape[-1], 1, 2), own, still)
         right = torch.zeros(len(samples), dtype=torch.bool)
         for number in range(folds):
             out = fold == number
-            right[out] = _predicted(samples, labelled.classes, out, settings) == labelled.classes[out]
+            right[out] = _predicted(samples, classes, out, settings) == classes[out]
         scores[group.name] = float(right.float().mean())
     return scores
 
@@ -105,8 +105,8 @@ def labelled_intensities(
     intensities = []
     for group in groups:
         own = video.patterns[:, [video.names.index(name) for name in group.regions]]
-        labelled = label_group(own, [labels], group, settings)
-        intensities.append(labelled.table[labelled.classes])
+        table, classes = label_group(own, [labels], group, settings)
+        intensities.append(table[classes])
     return torch.cat(intensities, dim=1)
 
 

@@ -16,11 +16,11 @@ from torchface.files.whole_files import make_folder
 from torchface.geometry.similarity import similarity_transform
 from torchface.modeling import ExpressionRegression, ExpressionSettings
 from torchface.progress import Progress
-from torchface.registration.own_topology import check_triangles
 from torchface.rendering.compositing import save_rendered_image
 from torchface.synthetic import draw_identities, performer
 
 from .expression_table import Comparison, compare, picture
+from .head_samples import check_triangles
 from .model_cards import model_card
 from .people_samples import People, warn_of_exchanged
 from .people_samples import gather as gather_people

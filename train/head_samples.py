@@ -8,15 +8,17 @@ from pathlib import Path
 import torch
 
 from torchface import Mesh, load_mesh
-from torchface.errors import FileFormatError
+from torchface.errors import FileFormatError, TopologyError
 from torchface.files.content_keys import content_key
 from torchface.geometry.meshes.unit_check import check_unit, extent
+from torchface.geometry.meshes.vertex_order import KEEP_ORDER
 from torchface.geometry.sample_batches import Samples, blocks
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io import MeshSequence, MeshSequenceWriter
 from torchface.io.meshes.named_files import named_files
+from torchface.mesh import other_topology
 from torchface.progress import Progress
-from torchface.registration.own_topology import check_own_topology, check_triangles
+from torchface.registration.own_topology import check_own_topology
 from torchface.rendering.clay_shading import sample_texture
 from torchface.synthetic import draw_identities, neutral_head
 from torchface.workflows.batch.batch_items import find_items
@@ -33,6 +35,16 @@ _LEAST_EXTENT, _MOST_EXTENT = 0.4, 2.5  # of a head beside the template, of one 
 _FAR, _FAR_SHARE = 10.0, 4.0
 _COMPARED = 1000  # vertices
 _FACE, _LEAST_FACE, _MOST_FACE = 250.0, 0.4, 4.0  # millimetres across, and how much less or more a template shows
+
+
+def check_triangles(source: Mesh, target: Mesh, name: str, owner: str = "the template") -> None:
+    """Refuses a target of other triangles than the source's."""
+    counts = [(len(mesh.vertices), len(mesh.faces)) for mesh in (target, source)]
+    if counts[0] != counts[1]:
+        found, expected = ("{} vertices and {} triangles".format(*count) for count in counts)
+        raise TopologyError(f"{name}: found {found}, expected those of {owner}, {expected}")
+    if target.fingerprint() != source.fingerprint():
+        raise TopologyError(f"{name}: found {other_topology(target.fingerprint(), source, owner)}; {KEEP_ORDER}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,11 +6,14 @@ expressions as the rig; ``--published FILE`` one of GNM Head, FLAME or Basel, wi
 where it was.
 """
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 
+import torchface
 from torchface import BlendshapeRig, Mesh, TorchfaceError, load_mesh, load_rig, zoo
 from torchface.errors import FileFormatError
+from torchface.files.model_roots import is_checkout
 from torchface.io import load_head_model_file, load_ict_facekit, load_identity_modes
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.rigs.ict_facekit import region
@@ -18,7 +21,7 @@ from torchface.mesh import submesh
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.progress import Progress
 from torchface.workflows.arkit.arkit_rig import published_head
-from torchface.zoo.model_folders import own_models
+from torchface.zoo.model_folders import HOME
 
 from .head_colors import fitted_colors
 from .head_figures import draw
@@ -89,7 +92,16 @@ class Settings(RecipeSettings):
     def __post_init__(self) -> None:
         super().__post_init__()
         if (self.ict is not None or self.published is not None) and self.out == _OUT:
-            object.__setattr__(self, "out", own_models() / "people")
+            object.__setattr__(self, "out", _own_models() / "people")
+
+
+def _own_models() -> Path:
+    """The folder for further models, which go by their names from it: ``$TORCHFACE_HOME``, the checkout's, else
+    ``models`` in the working directory, whose models go by their paths alone."""
+    if home := os.environ.get(HOME):
+        return Path(home)
+    package = Path(torchface.__file__).resolve().parent
+    return package.parent / "models" if is_checkout(package.parent, package.name) else Path("models")
 
 
 @dataclass(frozen=True, eq=False)
@@ -243,7 +255,7 @@ def load_template(path: Path, part: str | None = None, unit: str | None = None) 
 def _told(settings: Settings, trained: Trained) -> list[str]:
     """What was measured, and who takes the model up."""
     lines = metric_lines(trained.metrics)
-    if settings.out.parent == own_models():
+    if settings.out.parent == _own_models():
         lines.append("`torchface fit` and `track` take this model where none is named")
     return lines
 

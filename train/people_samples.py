@@ -20,8 +20,9 @@ from torchface.files.whole_files import make_folder
 from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.sample_batches import Samples, SamplesInMemory, blocks
 from torchface.progress import Progress
-from torchface.registration.own_topology import check_own_topology, check_triangles
+from torchface.registration.own_topology import check_own_topology
 
+from .head_samples import check_triangles
 from .sample_views import SampleRange, SamplesWithout
 from .tensor_shards import Shards
 

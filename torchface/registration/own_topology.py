@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import torch
 
-from torchface.errors import TopologyError
 from torchface.geometry.meshes.unit_check import check_unit, extent
-from torchface.geometry.meshes.vertex_order import KEEP_ORDER, check_vertex_order
+from torchface.geometry.meshes.vertex_order import check_vertex_order
 from torchface.geometry.similarity import similarity_transform
-from torchface.mesh import Mesh, other_topology
+from torchface.mesh import Mesh
 from torchface.registration.nonrigid.registration_record import RegistrationRecord
 from torchface.registration.scan_preparation import check_same_hand
 from torchface.registration.scan_registration import Registration
@@ -27,16 +26,6 @@ def as_it_is(template: Mesh, head: Mesh) -> Registration:
     note = "taken as it is, for its triangles are the template's (no scan to register)"
     record = RegistrationRecord("its triangles", 0.0, (), (note,), 0.0, 1.0, 0.0, 0.0, 1.0, slid=0.0, bent=False)
     return Registration(mesh, pose, torch.zeros(len(head.vertices)).double(), known, record)
-
-
-def check_triangles(source: Mesh, target: Mesh, name: str, owner: str = "the template") -> None:
-    """Refuses a target of other triangles than the source's."""
-    counts = [(len(mesh.vertices), len(mesh.faces)) for mesh in (target, source)]
-    if counts[0] != counts[1]:
-        found, expected = ("{} vertices and {} triangles".format(*count) for count in counts)
-        raise TopologyError(f"{name}: found {found}, expected those of {owner}, {expected}")
-    if target.fingerprint() != source.fingerprint():
-        raise TopologyError(f"{name}: found {other_topology(target.fingerprint(), source, owner)}; {KEEP_ORDER}")
 
 
 def check_own_topology(source: Mesh, target: Mesh, name: str = "neutral", owner: str = "the template") -> None:

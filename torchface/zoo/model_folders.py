@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 
 from torchface.errors import FileFormatError, NameMismatchError
-from torchface.files.model_roots import is_checkout, is_folder, is_model, model_names, model_roots
+from torchface.files.model_roots import is_folder, is_model, model_names, model_roots
 from torchface.files.models import DESCRIPTION, model_fault
 from torchface.zoo.hub import fetch_model, hub_reference
 from torchface.zoo.kinds import KINDS
@@ -72,15 +72,6 @@ def find(name_or_path: str | Path) -> Path:
         f"model: found no {given[:80]!r}{why}, expected one of {known}; or the path of a model's folder{trained}, "
         f"which goes by its name if it lies in ${HOME}{missing}"
     )
-
-
-def own_models() -> Path:
-    """The folder for further models, which go by their names from it: ``$TORCHFACE_HOME``, the checkout's, else
-    ``models`` in the working directory, whose models go by their paths alone."""
-    if home := os.environ.get(HOME):
-        return Path(home)
-    package = Path(__file__).resolve().parents[1]
-    return package.parent / "models" if is_checkout(package.parent, package.name) else Path("models")
 
 
 def is_path(name_or_path: str | Path) -> bool:

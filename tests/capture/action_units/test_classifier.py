@@ -92,8 +92,8 @@ def test_levels_follow_the_intensity_of_a_moving_stroke() -> None:
 def test_learned_labels_are_the_planted_intensities(regions: RegionVideo, session: RecordedSession) -> None:
     for group in GROUPS:
         rows = [regions.names.index(name) for name in group.regions]
-        known = label_group(regions.patterns[:, rows], [session.labels], group, TrainingSettings())
-        labelled, truth = known.table[known.classes], planted(session, group.units)
+        table, classes = label_group(regions.patterns[:, rows], [session.labels], group, TrainingSettings())
+        labelled, truth = table[classes], planted(session, group.units)
         for a in range(len(group.units)):
             assert torch.corrcoef(torch.stack([labelled[:, a], truth[:, a]]))[0, 1] > 0.93, group.units[a]
 

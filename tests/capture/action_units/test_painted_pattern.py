@@ -55,12 +55,11 @@ def test_a_flow_lays_one_pattern_on_another(regions: RegionVideo) -> None:
     size = reference.shape[-1]
     boxes = {str(i): (-0.5, -0.5, size - 0.5, size - 0.5) for i in range(len(reference))}
     grid = region_grid(boxes, list(boxes), size, size, size)
-    for method, left in (("dis", 0.5), ("farneback", 0.7)):
-        moved = aligned_grid(grid, neutral_flow(own, reference, method))
-        laid = torch.stack([
-            sample_regions(own[i : i + 1], moved[i : i + 1], torch.eye(2, 3)[None])[0, 0] for i in range(len(own))
-        ])  # fmt: skip
-        assert (laid - reference).abs().mean() < left * before, method
+    moved = aligned_grid(grid, neutral_flow(own, reference))
+    laid = torch.stack([
+        sample_regions(own[i : i + 1], moved[i : i + 1], torch.eye(2, 3)[None])[0, 0] for i in range(len(own))
+    ])  # fmt: skip
+    assert (laid - reference).abs().mean() < 0.5 * before
     with pytest.raises(ShapeError, match="patterns"):
         neutral_flow(own[:2], reference)
 

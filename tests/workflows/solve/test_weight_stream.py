@@ -11,10 +11,10 @@ from received_frames import decode_frame
 from torchface import BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.capture import MarkerSolver
 from torchface.cli import main
-from torchface.errors import ValueRangeError
+from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.shape_names import ARKIT
 from torchface.synthetic.stages.marker_stage import place_markers
-from torchface.workflows.solve.weight_stream import stream_weights
+from torchface.workflows.solve.weight_stream import stream_take
 
 
 @pytest.fixture
@@ -29,42 +29,36 @@ def address(receiver: socket.socket) -> str:
     return f"udp://127.0.0.1:{receiver.getsockname()[1]}"
 
 
-def test_frames_arrive_in_their_order_and_time(receiver: socket.socket) -> None:
-    weights = torch.rand(20, len(ARKIT), generator=torch.Generator().manual_seed(0))
-    now = [100.0]
+def sent(take: Take, receiver: socket.socket) -> list[float]:
+    """Sends a take by a clock of its own; the seconds at which it waited for a frame."""
+    now, begun = [100.0], list[float]()
 
     def wait(seconds: float) -> None:
         now[0] += seconds
+        begun.append(now[0] - 100)
 
+    words = stream_take(take, address(receiver), lambda: now[0], wait)
+    assert words.startswith(f"{len(take)} frames sent")
+    return begun
+
+
+def test_frames_arrive_in_their_order_and_time(receiver: socket.socket) -> None:
+    weights = torch.rand(20, len(ARKIT), generator=torch.Generator().manual_seed(0))
     turns = torch.rand(20, 9, generator=torch.Generator().manual_seed(1))
-    report = stream_weights(weights, ARKIT, 60.0, address(receiver), lambda: now[0], wait, rotations=turns)
+    columns = dict(zip(ROTATIONS, turns.T, strict=True))
+    begun = sent(Take(60.0, weights=Track(ARKIT, weights[..., None]), extras={"columns": columns}), receiver)
     frames = [decode_frame(receiver.recv(2048)) for _ in range(20)]
     assert [frame.frame for frame in frames] == list(range(20))
-    assert now[0] == pytest.approx(100 + 20 / 60)
-    assert torch.equal(report.weights, weights)
+    assert begun == pytest.approx([frame / 60 for frame in range(1, 20)])
     assert torch.equal(torch.stack([frame.weights for frame in frames]), weights)
     assert torch.equal(torch.stack([frame.rotations for frame in frames]), turns)
 
 
 def test_frames_at_uneven_times_go_out_at_these(receiver: socket.socket) -> None:
-    times, now = [0.0, 0.1, 0.15, 0.9, 1.0], [100.0]
-    begun: list[float] = []
-
-    def wait(seconds: float) -> None:
-        now[0] += seconds
-
-    def frames() -> Iterator[torch.Tensor]:
-        for _ in times:
-            begun.append(now[0] - 100)
-            yield torch.zeros(len(ARKIT))
-
-    stream_weights(frames(), ARKIT, 30.0, address(receiver), lambda: now[0], wait, times)
-    assert begun == pytest.approx(times)
-
-
-def test_no_frames(receiver: socket.socket) -> None:
-    with pytest.raises(ValueRangeError, match="no frame"):
-        stream_weights([], ARKIT, 60.0, address(receiver))
+    times, columns = [0.0, 0.1, 0.15, 0.9, 1.0], dict.fromkeys(ROTATIONS, torch.zeros(5))
+    still = Track(ARKIT, torch.zeros(5, len(ARKIT), 1))
+    take = Take(30.0, weights=still, extras={"columns": columns}, seconds=torch.tensor(times))
+    assert sent(take, receiver) == pytest.approx(times[1:])
 
 
 @pytest.mark.parametrize("options", [(), ("--frame-by-frame",)])

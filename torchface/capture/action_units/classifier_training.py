@@ -1,7 +1,6 @@
 """Training of a classifier of action units from performed ones."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -26,14 +25,6 @@ _CONTROL = 5  # of local warps: control points a side
 _REST_FRAMES = 2  # at either end of a repetition
 
 
-@dataclass(frozen=True, eq=False)
-class GroupClasses:
-    """The labels of a group's frames."""
-
-    table: Tensor  # intensities of the group's units in each class, (C,A); the first class is rest
-    classes: Tensor  # of every frame, (T,) int64
-
-
 def fit_classifier(
     videos: Sequence[RegionVideo],
     labels: Sequence[ActionLabels],
@@ -51,9 +42,9 @@ def fit_classifier(
     for group in groups:
         progress(f"{group.name}: labelling {len(patterns)} frames")
         own = patterns[:, [names.index(name) for name in group.regions]]
-        labelled = label_group(own, labels, group, settings)
+        table, classes = label_group(own, labels, group, settings)
         still = rest[:, [names.index(name) for name in group.regions]]
-        part = _fit_group(group, own, still, labelled, size, settings, progress)
+        part = _fit_group(group, (own, still), (table, classes), settings, progress)
         sizes.append(GroupSize(len(part.components), len(part.intensities)))
         parts.append(part)
     model = ActionUnitClassifier(groups, sizes, size)
@@ -78,9 +69,9 @@ def merged_videos(videos: Sequence[RegionVideo], names: Sequence[str]) -> tuple[
 
 def label_group(
     patterns: Tensor, labels: Sequence[ActionLabels], group: RegionGroup, settings: TrainingSettings
-) -> GroupClasses:
-    """The class of every frame: the set of the group's units and their intensity; 0 for rest; of regions (T,G,h,w) of
-    all videos.
+) -> tuple[Tensor, Tensor]:
+    """Intensities of the group's units in each class, (C,A), the first of which is rest, and the class of every frame,
+    (T,) int64: a set of units and a level; of regions (T,G,h,w) of all videos.
 
     Intensities are clustered for each performer and set of units, so a performer's strongest frames are the highest
     level.
@@ -103,7 +94,7 @@ def label_group(
                     rows.append(tuple(strength if unit in units else 0.0 for unit in group.units))
                 classes[frames[levels == level]] = class_of[units, level]
         start += own.frames
-    return GroupClasses(torch.tensor(rows), classes)
+    return torch.tensor(rows), classes
 
 
 def _frames(labels: ActionLabels, together: tuple[str, ...], start: int) -> tuple[Tensor, Tensor]:
@@ -120,30 +111,28 @@ def _frames(labels: ActionLabels, together: tuple[str, ...], start: int) -> tupl
 
 def _fit_group(
     group: RegionGroup,
-    patterns: Tensor,
-    rest: Tensor,
-    labelled: GroupClasses,
-    size: int,
+    shown: tuple[Tensor, Tensor],
+    labelled: tuple[Tensor, Tensor],
     settings: TrainingSettings,
     progress: Progress,
 ) -> GroupClassifier:
+    """Of regions and the same at rest, (T,G,h,w) each, and what :func:`label_group` says of them."""
+    size, (table, truth) = shown[0].shape[-1], labelled
     probe = GroupClassifier(group, size, 1, 2)
     generator = torch.Generator().manual_seed(settings.seed)
-    features, classes = [group_features(probe, patterns, rest)], [labelled.classes]
-    for _ in range(settings.warps):
-        features.append(group_features(probe, patterns, rest, settings.warp_amplitude, generator))
-        classes.append(labelled.classes)
-    samples, truth = torch.cat(features), torch.cat(classes)
+    features = [group_features(probe, *shown)]
+    features += [group_features(probe, *shown, settings.warp_amplitude, generator) for _ in range(settings.warps)]
+    samples, truth = torch.cat(features), truth.repeat(len(features))
     progress(f"{group.name}: principal components of {samples.shape[1]} features")
     mean = samples.double().mean(0)
     components, deviations = principal_components(samples, mean, settings.variance)
-    part = GroupClassifier(group, size, len(components), len(labelled.table))
+    part = GroupClassifier(group, size, len(components), len(table))
     part.mean.copy_(mean)
     part.components.copy_(components)
     part.deviations.copy_(deviations)
-    part.intensities.copy_(labelled.table)
+    part.intensities.copy_(table)
     reduced = (samples - part.mean) @ part.components.T / part.deviations
-    progress(f"{group.name}: {len(labelled.table)} classes of {len(components)} components")
+    progress(f"{group.name}: {len(table)} classes of {len(components)} components")
     part.machine.fit(reduced, truth, settings.penalty)
     return part
 

@@ -5,7 +5,6 @@ A dense flow between two performers' neutral images serves for every frame.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 import torch
@@ -13,8 +12,6 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.rendering.gaussian_blur import gaussian_blur
-
-Method = Literal["dis", "farneback"]
 
 _MIN_CONTRAST = 0.15
 _FRACTIONS = (0.01, 0.45)
@@ -98,21 +95,18 @@ def otsu_threshold(values: Tensor) -> float:
     return low + (high - low) * (level + 0.5) / 255
 
 
-def neutral_flow(own: Tensor, reference: Tensor, method: Method = "dis") -> Tensor:
+def neutral_flow(own: Tensor, reference: Tensor) -> Tensor:
     r"""The flow (R,h,w,2), pixels, from each pixel of the reference's neutral pattern to the same spot of one's own.
 
     .. math:: \text{own}(x + u(x)) \approx \text{reference}(x)
 
     Found once a performer, at rest, and used for every frame: a flow a frame would remove the expression.
 
-    Args:
-        method: OpenCV's dense flow: DIS, or Farnebäck's polynomials, which lose fine dashes more easily.
-
-    Source: Farnebäck 2003; Kroeger et al. 2016; thesis 4.1.12.
+    Source: Kroeger et al. 2016; thesis 4.1.12.
     """
     if own.shape != reference.shape or own.ndim != 3:
         raise ShapeError(f"patterns: found {tuple(own.shape)} and {tuple(reference.shape)}, expected (R,h,w) twice")
-    flows = [_flow(a, b, method) for a, b in zip(_grey(reference), _grey(own), strict=True)]
+    flows = [_flow(a, b) for a, b in zip(_grey(reference), _grey(own), strict=True)]
     return torch.stack(flows)
 
 
@@ -128,16 +122,9 @@ def _grey(patterns: Tensor) -> np.ndarray:
     return (255 * soft.clamp(0, 1)).round().byte().numpy()
 
 
-def _flow(start: np.ndarray, end: np.ndarray, method: Method) -> Tensor:
+def _flow(start: np.ndarray, end: np.ndarray) -> Tensor:
     import cv2
 
-    still = np.zeros((*start.shape, 2), dtype=np.float32)
-    if method == "dis":
-        solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-        solver.setFinestScale(0)
-        flow = solver.calc(start, end, still)
-    else:
-        flow = cv2.calcOpticalFlowFarneback(
-            start, end, still, pyr_scale=0.5, levels=3, winsize=13, iterations=10, poly_n=7, poly_sigma=1.5, flags=256
-        )
-    return torch.from_numpy(np.ascontiguousarray(flow))
+    solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    solver.setFinestScale(0)
+    return torch.from_numpy(solver.calc(start, end, np.zeros((*start.shape, 2), np.float32)))

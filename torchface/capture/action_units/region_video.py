@@ -9,16 +9,17 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.capture.action_units.painted_pattern import Method, aligned_grid, neutral_flow, pattern_levels
+from torchface.capture.action_units.painted_pattern import aligned_grid, neutral_flow, pattern_levels
 from torchface.capture.action_units.painted_regions import region_grid, sample_regions
 from torchface.capture.action_units.stabilization import PointTracker, steady_transforms
-from torchface.errors import AlignmentError, ShapeError
+from torchface.errors import AlignmentError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.action_labels import ActionLabels
 from torchface.io.video import VideoFile, open_video
 from torchface.progress import Progress, silent
 
 SIZE = 48
 _CHUNK = 64
+_STILL = torch.eye(2, 3)[None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +68,6 @@ def read_regions(
     names: Sequence[str],
     reference: Tensor | None = None,
     size: int = SIZE,
-    method: Method = "dis",
     progress: Progress | None = None,
 ) -> RegionVideo:
     """Stabilises a video, cuts its regions out, thresholds the pattern and warps it to a reference's.
@@ -78,7 +78,6 @@ def read_regions(
         names: which regions, R, in which order.
         reference: another performer's neutral patterns (R,h,w), to which these are warped; none if absent.
         size: pixels a side of a region.
-        method: of the flow to the reference.
         progress: called with each step and how far it is.
 
     Raises:
@@ -88,7 +87,7 @@ def read_regions(
         AlignmentError: helmet or markers cannot be followed.
         NameMismatchError: a region has no box.
     """
-    film = open_regions(video, labels, names, reference, size, method, progress)
+    film = open_regions(video, labels, names, reference, size, progress)
     return RegionVideo(film.names, torch.cat(list(film.chunks())), film.neutral, film.rest, film.fps)
 
 
@@ -98,30 +97,28 @@ def open_regions(
     names: Sequence[str],
     reference: Tensor | None = None,
     size: int = SIZE,
-    method: Method = "dis",
     progress: Progress | None = None,
 ) -> RegionFilm:
     """What :func:`read_regions` reads, with a few frames in memory at a time."""
     video = video if isinstance(video, VideoFile) else open_video(video)
-    grid = region_grid(labels.regions, names, size, video.width, video.height)
     _check_length(video, labels, video.count)
     still = video.frame(labels.neutral)
-    levels = pattern_levels(sample_regions(still[None].float() / 255, grid, _identity())[0], names)
+    grey = still[None].float() / 255
+    try:
+        grid = region_grid(labels.regions, names, size, video.width, video.height)
+        levels = pattern_levels(sample_regions(grey, grid, _STILL)[0], names)
+        neutral = levels.pattern(sample_regions(grey, grid, _STILL)[0])
+        if reference is not None:
+            grid = aligned_grid(grid, neutral_flow(neutral, reference))
+        tracker = PointTracker(still, torch.tensor(labels.helmet), torch.tensor(labels.markers))
+        tracked = [tracker(chunk) for chunk in video.chunks(_CHUNK)]
+        transforms = steady_transforms(tracker.points, torch.cat(tracked))
+    except (AlignmentError, NameMismatchError, ValueRangeError) as error:
+        raise type(error)(f"{labels.source}: {error} ({video.path.name})") from None
+    _check_length(video, labels, len(transforms))
     if levels.dark:
         warnings.warn(f"{video.path.name}: the paint is taken to be darker than the skin", stacklevel=2)
-    neutral = levels.pattern(sample_regions(still[None].float() / 255, grid, _identity())[0])
-    if reference is not None:
-        grid = aligned_grid(grid, neutral_flow(neutral, reference, method))
-    tracked = []
-    try:
-        tracker = PointTracker(still, torch.tensor(labels.helmet), torch.tensor(labels.markers))
-        for chunk in video.chunks(_CHUNK):
-            tracked.append(tracker(chunk))
-        _check_length(video, labels, sum(len(chunk) for chunk in tracked))
-        transforms = steady_transforms(tracker.points, torch.cat(tracked))
-    except AlignmentError as error:
-        raise AlignmentError(f"{labels.source}: {error} ({video.path.name})") from None
-    rest = levels.pattern(sample_regions(still[None].float() / 255, grid, transforms[labels.neutral, None]))[0]
+    rest = levels.pattern(sample_regions(grey, grid, transforms[labels.neutral, None]))[0]
 
     def chunks() -> Iterator[Tensor]:
         done = 0
@@ -131,10 +128,6 @@ def open_regions(
             (progress or silent)(f"reading regions of {video.path.name}", done, labels.frames)
 
     return RegionFilm(tuple(names), neutral, rest, video.fps, chunks)
-
-
-def _identity() -> Tensor:
-    return torch.eye(2, 3)[None]
 
 
 def _check_length(video: VideoFile, labels: ActionLabels, found: int) -> None:

@@ -5,6 +5,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError
+from torchface.temporal import interpolated
 
 _WINDOW = 15
 _LEVELS = 3
@@ -129,11 +130,7 @@ def steady_transforms(reference: Tensor, tracked: Tensor) -> Tensor:
 def _filled(tracked: Tensor) -> Tensor:
     """Lost places (T,P,2) on the straight line between the frames before and after."""
     filled = tracked.clone()
-    frames = np.arange(len(tracked))
     for p in range(tracked.shape[1]):  # three points
-        known = ~tracked[:, p].isnan().any(1).numpy()
-        if not known.all():
-            for axis in (0, 1):
-                curve = np.interp(frames, frames[known], tracked[known, p, axis].numpy())
-                filled[:, p, axis] = torch.from_numpy(curve)
+        rows = (~tracked[:, p].isnan().any(1)).nonzero()[:, 0]
+        filled[:, p] = interpolated(tracked[rows, p], rows, len(tracked))
     return filled

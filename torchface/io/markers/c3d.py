@@ -140,13 +140,13 @@ def _positions(data: bytes, sections: Sections, path: Path) -> np.ndarray:
 
 
 def _labels(sections: Sections, points: int) -> tuple[str, ...]:
-    groups = [(int(match[1] or 1), name) for name in sections.parameters if (match := _is_labels(name))]
+    groups = [
+        (int(match[1] or 1), name)
+        for name in sections.parameters
+        if (match := re.fullmatch(r"POINT:LABELS([0-9]{0,3})", name))
+    ]
     labels = [label.strip() for _, name in sorted(groups) for label in sections.texts(name)][:points]
     return unique_labels(labels + [""] * (points - len(labels)))
-
-
-def _is_labels(name: str) -> re.Match[str] | None:
-    return re.fullmatch(r"POINT:LABELS([0-9]{0,3})", name)
 
 
 def _axes(sections: Sections, path: Path) -> np.ndarray | None:

@@ -77,7 +77,7 @@ class VTubeStudioSender:
     """Sends frames in a thread of its own: the newest one as soon as the one before has been answered.
 
     The first time the user is asked in VTube Studio; the token that it then gives is kept. A connection that ends is
-    opened again. Beside the parameters that every model has, 52 of its own are made, named as ARKit's with a capital.
+    opened again. Beside the parameters that every model has, 50 by ARKit's names with a capital are made.
 
     Args:
         token: the file of the token; in the user's cache if absent.

@@ -1,5 +1,6 @@
 """A head camera's predictions as weight curves for a marker take."""
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -140,11 +141,9 @@ def video_warnings(alone: Take, predicted: Predicted) -> list[str]:
 
 def _fitting_table(units: tuple[str, ...], names: tuple[str, ...]) -> str:
     for name in built_in_tables():
-        try:
+        with suppress(NameMismatchError):
             load_shape_table(name).matrix(units, names)
-        except NameMismatchError:
-            continue
-        return name
+            return name
     raise NameMismatchError(
         f"shape table: found no built-in one ({', '.join(built_in_tables())}) for a rig with {', '.join(names[:5])}, "
         "...; expected one for this rig (--table FILE)"

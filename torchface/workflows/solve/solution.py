@@ -35,7 +35,6 @@ from torchface.workflows.solve.take_check import (
     label_warnings,
     neutral_warnings,
 )
-from torchface.workflows.solve.weight_stream import StreamReport
 
 # A take is cleaned again where its alignment moves a site farther after the first cleaning, mm.
 _REALIGNED = 0.1
@@ -129,9 +128,8 @@ class SolveReport:
     seen: float  # fraction of the samples of the attachment's markers that were seen
     seconds: float
     predicted: Predicted | None = None  # what the head camera saw, where there was a video
-    sent: StreamReport | None = None  # what was streamed, where that was asked for
     warnings: tuple[str, ...] = ()  # what the user should know before they use the weights
-    notes: tuple[str, ...] = ()  # what else there is to say of the files
+    notes: tuple[str, ...] = ()  # what else there is to say of the files, and what was streamed
 
     def verdict(self) -> str:
         """Whether the weights are to be used, in a line."""
@@ -180,7 +178,7 @@ class SolveReport:
             shapes = ", ".join(self.predicted.gamma.names) or "no shape"
             lines.append(f"video: predicts {shapes} in {100 * float(active.any(1).float().mean()):.0f} % of the frames")
             lines.extend(f"  {note}" for note in self.predicted.notes)
-        return [*lines, *([] if self.sent is None else self.sent.lines())]
+        return lines
 
 
 def solve_markers(

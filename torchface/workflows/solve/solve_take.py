@@ -10,12 +10,11 @@ from torchface.attachment import Attachment
 from torchface.errors import ValueRangeError
 from torchface.io import load_rig
 from torchface.io.protocols.weight_sender import find_receiver
-from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.progress import Progress, silent
 from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions, frame_span, read_markers
 from torchface.workflows.solve.head_camera import HeadCamera, predicted_curves
 from torchface.workflows.solve.solution import SolveReport, SolveSettings, solve_markers
-from torchface.workflows.solve.weight_stream import stream_weights
+from torchface.workflows.solve.weight_stream import stream_take
 from torchface.workflows.weight_files import WeightFiles, check_live_link, with_eyes, write_weights
 
 
@@ -82,13 +81,8 @@ def solve_take(
         write_solve_page(outputs.report, inputs.take.name, report)
     if outputs.stream is not None:
         progress(f"sending to {outputs.stream}")
-        solved = with_eyes(solution.take, rig)
-        turns = torch.stack([torch.as_tensor(solved.extras["columns"][name]) for name in ROTATIONS], 1)
-        times = solved.times.tolist()
-        sent = stream_weights(
-            solution.weights, rig.names, solved.fps, outputs.stream, times=times, rotations=turns.float()
-        )
-        report = replace(report, sent=sent)
+        sent = stream_take(with_eyes(solution.take, rig), outputs.stream)
+        report = replace(report, notes=(*report.notes, sent))
     return report
 
 

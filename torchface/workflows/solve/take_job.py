@@ -1,6 +1,6 @@
 """One marker take of many, solved from file to file."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import torch
@@ -39,8 +39,6 @@ class TakeJob:
     def key(self, item: BatchItem) -> str:
         """A key of all that the take's weights depend on."""
         camera = None if self.camera is None else item.settings_of(self.camera)
-        if camera is not None:
-            camera = replace(camera, labels=camera.labels_file, classifier=model_content(camera.classifier))
         return content_key(
             _METHOD,
             take=item.path,
@@ -49,6 +47,7 @@ class TakeJob:
             settings=self.settings,
             part=self.part,
             camera=camera,
+            watched=None if camera is None else [camera.labels_file, model_content(camera.classifier)],
             options=item.settings_of(self.options),
             written=[str(path) for path in (self.animation, self.report, self.live_link)],
             reduce=self.reduce,

@@ -1,65 +1,31 @@
-"""Frames of weights sent in their own time."""
+"""A solved take, sent in its own time."""
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable
 from contextlib import closing
-from dataclasses import dataclass
 
 import torch
-from torch import Tensor
 
-from torchface.errors import ValueRangeError
+from torchface.io.weights.weight_csv import ROTATIONS
+from torchface.take import Take
 from torchface.workflows.live.weight_streams import mapped_sender
 
 
-@dataclass(frozen=True, eq=False)
-class StreamReport:
-    """What was sent."""
-
-    weights: Tensor  # of each frame, (T,N)
-    latency: Tensor  # from when the frame was due to its packet on the way, (T,), milliseconds
-
-    def lines(self) -> list[str]:
-        """For people to read."""
-        worst = float(self.latency.quantile(0.99))
-        return [
-            f"{len(self.weights)} frames sent, {float(self.latency.median()):.2f} ms from frame to packet "
-            f"(99th percentile {worst:.2f} ms)"
-        ]
-
-
-def stream_weights(
-    frames: Iterable[Tensor],
-    names: Sequence[str],
-    fps: float,
-    address: str,
-    clock: Callable[[], float] = time.perf_counter,
-    wait: Callable[[float], None] = time.sleep,
-    times: Sequence[float] | None = None,
-    rotations: Tensor | None = None,
-) -> StreamReport:
-    """Sends frames of weights (N,), taken when they are due, at ``fps`` or at times in seconds after the first.
-
-    ``rotations`` (T,9) are Live Link Face's of head and eyes, radians; none turn if absent.
-    """
-    sent: list[Tensor] = []
-    latency: list[float] = []
-    coming = iter(frames)
-    with closing(mapped_sender(address, names, fps)) as sender:
+def stream_take(
+    take: Take, address: str, clock: Callable[[], float] = time.perf_counter, wait: Callable[[float], None] = time.sleep
+) -> str:
+    """Sends each frame of a take with weights and rotations (``extras["columns"]``) at its time; what was sent, in
+    words."""
+    assert take.weights is not None
+    turns = torch.stack([torch.as_tensor(take.extras["columns"][name]) for name in ROTATIONS], 1).float()
+    latency = []  # from when each frame was due to its packet on the way, milliseconds
+    with closing(mapped_sender(address, take.weights.names, take.fps)) as sender:
         begin = clock()
-        while True:
-            row = len(sent)
-            due = row / fps if times is None or row >= len(times) else times[row]
-            early = begin + due - clock()
-            if early > 0:
+        for weights, turn, due in zip(take.weights.values[..., 0], turns, take.times.tolist(), strict=True):
+            if (early := begin + due - clock()) > 0:
                 wait(early)
             came = clock()
-            weights = next(coming, None)
-            if weights is None:
-                break
-            sender.send(weights, None if rotations is None else rotations[row])
+            sender.send(weights, turn)
             latency.append(1000 * (clock() - came))
-            sent.append(weights)
-    if not sent:
-        raise ValueRangeError("stream: found no frame, expected at least one")
-    return StreamReport(torch.stack(sent), torch.tensor(latency))
+    typical, worst = torch.tensor(latency).quantile(torch.tensor([0.5, 0.99])).tolist()
+    return f"{len(latency)} frames sent, {typical:.2f} ms from frame to packet (99th percentile {worst:.2f} ms)"
