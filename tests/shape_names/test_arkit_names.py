@@ -1,12 +1,13 @@
 """Weights keep their meaning from one naming to the other."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 import torch
 
-from torchface.shape_names import ARKIT, arkit_sources, mapping, mirror
+from torchface.shape_names import ARKIT, antagonists, arkit_sources, mapping, mirror
 
 
 def test_arkit_has_52_names_and_its_mirror_is_an_involution() -> None:
@@ -35,6 +36,15 @@ def test_arkit_has_52_names_and_its_mirror_is_an_involution() -> None:
 )
 def test_sides_stand_anywhere_in_a_name(left: str, right: str) -> None:
     assert mirror(["jaw", right, left, "∧", "AU12_r", "AU12_c", "roll"]).tolist() == [0, 2, 1, 3, 4, 5, 6]
+
+
+def test_other_programs_names_mean_arkits_where_no_other_name_is_spelled_so() -> None:
+    maya = ["hero_bs." + re.sub("(.*)(L|R)(eft|ight)$", r"\2_\1", name) for name in ARKIT]
+    for matrix in (mapping(ARKIT, maya), mapping(maya, ARKIT)):
+        assert torch.equal(matrix, torch.eye(52))
+    assert len(antagonists(maya)) == len(antagonists(ARKIT)) > 0
+    assert mapping(["jawOpen"], ["A25_Jaw_Open", "jawOpen"]).tolist() == [[0], [1]]  # one shape for one motion
+    assert mapping(["browInnerUp"], ["Brow_Raise_Inner_L", "browInnerUp"]).tolist() == [[0], [1]]
 
 
 def test_live_link_spelling_is_a_permutation() -> None:

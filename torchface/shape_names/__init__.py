@@ -4,6 +4,7 @@ from torchface.shape_names.arkit_names import (
     ANTAGONISTS,
     ARKIT,
     antagonists,
+    arkit_name,
     arkit_sources,
     mapping,
     mirror,
@@ -12,7 +13,7 @@ from torchface.shape_names.arkit_names import (
 from torchface.shape_names.arkit_names import near_names as near_names
 from torchface.shape_names.name_tables import METAHUMAN, UNIFIED, VISEMES, VRM0, VRM1, ClipTable, TwinTable
 from torchface.shape_names.pose_names import is_action_unit as is_action_unit
-from torchface.shape_names.recognised_names import RecognisedShape, arkit_name, recognised_shapes
+from torchface.shape_names.recognised_names import RecognisedShape, recognised_shapes
 from torchface.shape_names.recognised_names import recognised_mapping as recognised_mapping
 from torchface.shape_names.recognised_names import vowel_sources as vowel_sources
 

@@ -9,74 +9,12 @@ from itertools import takewhile
 import torch
 from torch import Tensor
 
-from torchface.shape_names.arkit_names import ARKIT, mapping
+from torchface.shape_names.arkit_names import ARKIT, arkit_name, mapping
 from torchface.shape_names.name_tables import METAHUMAN, VRM1
 from torchface.shape_names.pose_names import posed_weights
 
-_PREFIX = re.compile(
-    r"^(.*__(?=facs_)|.*(?=Fcl_)(?<!^)|.*[.:|](?=[^.:|]{3,}$)|(?:facs_)?(?:bs|jnt|ctrl|cbs)_|facs_|[at]\d\d_|arkit[_ ]|"
-    r"au\d+_(?=[a-z]{3})|(?:head|face|blendshapes?|bs)\d*_(?=[a-z]))",
-    re.IGNORECASE,
-)
-_SUFFIX = re.compile(r"(_div\d+|_hd\d*|\.\d{3})$", re.IGNORECASE)
-_WORD = re.compile(r"[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+")
-_SIDE = {"l": "left", "r": "right", "lf": "left", "lt": "left", "rt": "right"}
-_ONE_SIDE = re.compile(r"[_.]([LR])$", re.IGNORECASE)
 _SHARED_PREFIX = re.compile(r"(?:(?!(?:l|r|left|right|fcl)[^a-z0-9])[a-z0-9]*[^a-z0-9])+", re.IGNORECASE)
 _SHARED_SUFFIX = re.compile(r"(?:[^a-z0-9](?!(?:l|r|left|right)(?![a-z0-9]))[a-z0-9]+)+$", re.IGNORECASE)
-_SPELLING = {"eyes": "eye", "brows": "brow", "eyebrow": "brow", "eyebrows": "brow", "lips": "lip"}
-
-_SIDED = {
-    "eyeBlink": (
-        "Fcl_EYE_Close_*",
-        "blink*",
-        "Blink_*",
-        "Eye_Blink_*",
-        "eCTRLEyesClosed*",
-        "EyeClosed*",
-        "EyesClosed*",
-    ),
-    "eyeLookUp": ("Eye_*_Look_Up", "EyeLookUp*"),
-    "eyeLookDown": ("Eye_*_Look_Down",),
-    "eyeSquint": ("Eye_Squint_*",),
-    "eyeWide": ("Eye_Wide_*", "EyeWiden*", "EyesWide*"),
-    "browDown": ("Brow_Drop_*", "Brow_Lower_*", "BrowLowerer*"),
-    "browOuterUp": ("Brow_Raise_Outer_*", "OuterBrowRaiser*", "BrowRaiseOuter*"),
-    "browInnerUp": ("Brow_Raise_Inner_*", "InnerBrowRaiser*", "BrowRaiseInner*"),
-    "cheekSquint": ("Cheek_Raise_*", "CheekRaiser*"),
-    "cheekPuff": ("Cheek_Blow_*", "CheekBlow*"),
-    "noseSneer": ("Nose_Crease_*", "NoseWrinkler*"),
-    "mouthSmile": ("LipCornerPuller*", "MouthCornerPull*"),
-    "mouthFrown": ("LipCornerDepressor*", "MouthCornerDepress*"),
-    "mouthDimple": ("Dimpler*", "Mouth_Dimple_*"),
-    "mouthStretch": ("LipStretcher*",),
-    "mouthPress": ("LipPressor*",),
-    "mouthUpperUp": ("Mouth_Up_Upper_*", "UpperLipRaiser*"),
-    "mouthLowerDown": ("Mouth_Down_Lower_*", "LowerLipDepressor*"),
-}
-"""Other programs' names of shapes that have sides; ``*`` stands for the side in any spelling."""
-
-_GAZE = {
-    "eyeLookOutLeft": ("Eye_L_Look_L", "eyeLookLeftL"),
-    "eyeLookInLeft": ("Eye_L_Look_R", "eyeLookRightL"),
-    "eyeLookInRight": ("Eye_R_Look_L", "eyeLookLeftR"),
-    "eyeLookOutRight": ("Eye_R_Look_R", "eyeLookRightR"),
-}
-"""Names in which an eye's side and the way it looks are distinguished by their order."""
-
-_PLAIN = {
-    "jawOpen": ("Jaw_Drop",),
-    "jawForward": ("Jaw_Fwd", "JawThrust", "Jaw_Front"),
-    "mouthPucker": ("LipPucker", "Mouth_Pucker_All"),
-    "mouthFunnel": ("LipFunneler",),
-    "mouthRollUpper": ("Mouth_Roll_In_Upper", "LipRollUpper"),
-    "mouthRollLower": ("Mouth_Roll_In_Lower", "LipRollLower"),
-    "tongueOut": ("Tongue_Out", "TongueStickOut", "V_Tongue_Out"),
-    "cheekPuff": ("Cheek_Puff", "CheekPuffBoth"),
-}
-"""Other programs' names of the other shapes."""
-
-
 _VOWEL = re.compile(r"(?:fcl_mth_|vrc[._]v_)(a|i|u|e|o|aa|ih|ou|oh)", re.IGNORECASE)
 _CLIPS = {"a": "aa", "i": "ih", "u": "ou", "e": "ee", "o": "oh"}
 _MOODS = {
@@ -217,59 +155,3 @@ def vowel_sources(name: str) -> dict[str, float]:
 @cache
 def _vowels() -> dict[str, dict[str, float]]:
     return VRM1.factors(tuple(_CLIPS.values()))
-
-
-def arkit_name(name: str) -> str | None:
-    """ARKit's name of a shape that another program has named; with a side behind it for half of a shape without one.
-
-    Example:
-        >>> arkit_name("facs_bs_MouthSmileLeft_div2"), arkit_name("Mouth_Up_Upper_R"), arkit_name("viseme_aa")
-        ('mouthSmileLeft', 'mouthUpperUpRight', None)
-    """
-    words = _words(name)
-    return _table().get(words) or _table().get(tuple(sorted(words)))
-
-
-def side_written_out(name: str) -> str:
-    """A name that ends in the side's first letter, as Blender wants it, with the side as ARKit writes it.
-
-    Example:
-        >>> side_written_out("browDown_L"), side_written_out("jawOpen"), side_written_out("Mouth_L")
-        ('browDownLeft', 'jawOpen', 'MouthLeft')
-    """
-    return _ONE_SIDE.sub(lambda found: _SIDE[found[1].lower()].capitalize(), name)
-
-
-def _words(name: str) -> tuple[str, ...]:
-    """The words of a name in lower case, sides written out; without what programs put around it."""
-    previous = ""
-    while previous != name:
-        previous, name = name, _PREFIX.sub("", _SUFFIX.sub("", name))
-    words = [word.lower() for word in _WORD.findall(name)]
-    return tuple(_SPELLING.get(word, _SIDE.get(word, word)) for word in words)
-
-
-@cache
-def _table() -> dict[tuple[str, ...], str]:
-    table: dict[tuple[str, ...], str] = {}
-
-    def add(name: str, arkit: str) -> None:
-        table.setdefault(tuple(sorted(_words(name))), arkit)
-
-    for arkit, aliases in _GAZE.items():
-        table |= {_words(alias): arkit for alias in aliases}
-    for arkit in ARKIT:
-        table[(arkit.lower(),)] = arkit
-        add(arkit, arkit)
-    for arkit in ARKIT:
-        if not arkit.endswith(("Left", "Right")):
-            for side in ("Left", "Right"):
-                add(f"{arkit}_{side}", f"{arkit}{side}")
-    for whole, sided in _SIDED.items():
-        for side in ("Left", "Right"):
-            for alias in sided:
-                add(alias.replace("*", f"_{side}_").strip("_"), f"{whole}{side}")
-    for whole, plain in _PLAIN.items():
-        for alias in plain:
-            add(alias, whole)
-    return table

@@ -22,14 +22,14 @@ const canonical = (name) =>
 
 const ROW = new Map(ARKIT.map((name, row) => [canonical(name), row]));
 
-const PREFIX = /^(.*__(?=facs_)|.*(?=Fcl_)(?<!^)|.*[.:|](?=[^.:|]{3,}$)|(?:facs_)?(?:bs|jnt|ctrl|cbs)_|facs_|[at]\d\d_|arkit[_ ]|(?:head|face|blendshapes?|bs)\d*_(?=[a-z]))/i;
+const PREFIX = /^(.*__(?=facs_)|.*(?=Fcl_)(?<!^)|.*[.:|](?=[^.:|]{3,}$)|(?:facs_)?(?:bs|jnt|ctrl|cbs)_|facs_|[at]\d\d_|arkit[_ ]|au\d+_(?=[a-z]{3})|(?:head|face|blendshapes?|bs)\d*_(?=[a-z]))/i;
 const SUFFIX = /(_div\d+|_hd\d*|\.\d{3})$/i;
-const SPELLING = { eyes: "eye", brows: "brow", eyebrow: "brow", eyebrows: "brow", lips: "lip", l: "left", r: "right", lt: "left", rt: "right" };
+const SPELLING = { eyes: "eye", brows: "brow", eyebrow: "brow", eyebrows: "brow", lips: "lip", l: "left", r: "right", lf: "left", lt: "left", rt: "right" };
 const BY_WORDS = new Map(Object.entries(RECOGNISED).flatMap(([name, all]) => all.map((words) => [words, name])));
 
 /** ARKit's name of a shape that another program has named, as torchface's `shape_names.arkit_name`. */
 export function arkitName(name) {
-  for (let before = ""; before !== name; ) [before, name] = [name, name.replace(PREFIX, "").replace(SUFFIX, "")];
+  for (let before = ""; before !== name; ) [before, name] = [name, name.replace(SUFFIX, "").replace(PREFIX, "")];
   const words = (name.match(/[A-Z]+(?![a-z])|[A-Z]?[a-z]+|\d+/g) ?? []).map((word) => SPELLING[word.toLowerCase()] ?? word.toLowerCase());
   return BY_WORDS.get(words.join(" ")) ?? BY_WORDS.get(words.sort().join(" "));
 }

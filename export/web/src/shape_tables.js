@@ -1,4 +1,4 @@
-// torchface's tables of shape names, torchface/shape_names/recognised_names.py and name_tables.py; a test compares them.
+// torchface's tables of shape names, torchface/shape_names/arkit_names.py, recognised_names.py and name_tables.py; a test compares them.
 
 /** The words of what other programs call each of ARKit's shapes; those of no fixed order are sorted. */
 export const RECOGNISED = {
@@ -19,7 +19,7 @@ export const RECOGNISED = {
   jawForward: ["jawforward", "forward jaw", "fwd jaw", "jaw thrust", "front jaw"],
   jawRight: ["jawright", "jaw right"],
   jawLeft: ["jawleft", "jaw left"],
-  jawOpen: ["jawopen", "jaw open"],
+  jawOpen: ["jawopen", "jaw open", "drop jaw"],
   mouthClose: ["mouthclose", "close mouth"],
   mouthFunnel: ["mouthfunnel", "funnel mouth", "funneler lip"],
   mouthPucker: ["mouthpucker", "mouth pucker", "lip pucker", "all mouth pucker"],

@@ -9,7 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from torchface.errors import ValueRangeError
-from torchface.shape_names import ARKIT, VRM1, mapping, recognised_names, vowel_sources
+from torchface.shape_names import ARKIT, VRM1, arkit_names, mapping, vowel_sources
 from torchface.workflows.live.live_frames import LiveFrame
 from torchface.workflows.live.weight_controls import WeightControls, read_weight_settings
 
@@ -44,6 +44,9 @@ def test_names_of_other_programs_are_recognised_by_the_same_tables(run: Run) -> 
         "mixamorig:jawOpen.001",
         "LipCornerPullerR",
         "V_Open",
+        "lf_mouth_smile",
+        "AU26_jawDrop",
+        "jawOpen.001",
         "Face.M_F00_Fcl_MTH_A",
         "vrc.v_ou",
         "vrc.v_pp",
@@ -52,10 +55,10 @@ def test_names_of_other_programs_are_recognised_by_the_same_tables(run: Run) -> 
     ]
     answer = run("tables", names)
     table: dict[str, list[str]] = {}
-    for words, arkit in recognised_names._table().items():
+    for words, arkit in arkit_names._table().items():
         table.setdefault(arkit, []).append(" ".join(words))
     assert answer["RECOGNISED"] == table
-    assert answer["names"] == [recognised_names.arkit_name(name) for name in names]
+    assert answer["names"] == [arkit_names.arkit_name(name) for name in names]
     for name, rule in zip(names, answer["rules"], strict=True):
         assert {ARKIT[row]: factor for row, factor in rule} == pytest.approx(vowel_sources(name), abs=1e-5)
     assert answer["VRM_POSES"] == VRM1.poses

@@ -8,7 +8,7 @@ from torch import Tensor
 from torchface.capture.antagonist_shapes import signed_quantities
 from torchface.capture.energy import Quadratic
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.shape_names import arkit_name, mirror
+from torchface.shape_names import mirror
 
 HOLD, RELAXATION = 0.3, 0.3
 """Seconds that a hidden shape keeps its weight, and those in which it then falls to 1/e: at rest within about one."""
@@ -52,7 +52,7 @@ def twins_of(names: Sequence[str]) -> Tensor:
     Antagonists are none: a jaw is left or right, and eyes look aside together.
     """
     twins = mirror(names)
-    alone = signed_quantities([arkit_name(name) or name for name in names]).abs()
+    alone = signed_quantities(names).abs()
     sides = torch.arange(len(names))
     looks = torch.tensor(["look" in name.lower() for name in names])
     opposed = (alone.T @ alone)[sides, twins] > 0

@@ -16,7 +16,7 @@ from torchface.io.tables.timecode import read_timecodes, timecodes_at, write_tim
 from torchface.io.tables.track_checks import kept_columns, values_to_write
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.number_checks import check_rate
-from torchface.shape_names import ARKIT, mapping
+from torchface.shape_names import ARKIT, mapping, spelled_as
 from torchface.take import Take, Track
 
 _TIMECODE, _COUNT = "timecode", "blendshapecount"
@@ -36,8 +36,7 @@ def are_live_link_shapes(names: Sequence[str]) -> bool:
 
 def not_in_live_link(names: Sequence[str]) -> tuple[str, ...]:
     """The names of shapes that Live Link Face's file would not give back: halves that it merges, and those it lacks."""
-    matrix = mapping(names, ARKIT)
-    return tuple(name for name, comes_back in zip(names, (matrix == 1).any(0).tolist(), strict=True) if not comes_back)
+    return tuple(name for name in names if spelled_as(name, ARKIT) is None)
 
 
 def load_live_link(path: str | Path) -> Take:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
-from torchface.shape_names import antagonists, arkit_name, mirror
+from torchface.shape_names import antagonists, mirror
 from torchface.take import Take, Track
 
 _FPS = 60.0
@@ -45,7 +45,7 @@ class WeightEditor:
         self.low = start.amin(0).clamp(max=0.0)
         self.high = start.amax(0).clamp(min=1.0)
         self._loaded = start.clone()
-        opposed = antagonists([arkit_name(name) or name for name in names]).sort(1).values.tolist()
+        opposed = antagonists(names).sort(1).values.tolist()
         twins = enumerate(mirror(names).tolist())
         self._twins = [row if sorted([row, twin]) in opposed else twin for row, twin in twins]
         self._frame = 0

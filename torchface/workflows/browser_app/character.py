@@ -24,7 +24,7 @@ from torchface.io.scenes.missing_shapes import no_shapes, no_target
 from torchface.io.tables.csv_table import quoted
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
-from torchface.shape_names import ARKIT, mapping, recognised_shapes, vowel_sources
+from torchface.shape_names import ARKIT, recognised_shapes, spelled_as, vowel_sources
 from torchface.synthetic import character
 from torchface.workflows.cached_graph import cached_file
 
@@ -164,11 +164,12 @@ def _shapes(document: Document, followers: set[str]) -> tuple[str, ...]:
 
 def _recognised(names: Sequence[str]) -> dict[str, ShapeRule]:
     """Rules for shapes that other programs call otherwise, such as ``A25_Jaw_Open`` or ``Fcl_EYE_Close_L``."""
-    known = mapping(ARKIT, names).any(1).tolist()
-    plain = {name for name, known_one in zip(names, known, strict=True) if known_one}
     found = recognised_shapes(names)
     rules = {
-        name: ShapeRule({arkit: 1.0}) for arkit, shape in found.items() for name in shape.names if name not in plain
+        name: ShapeRule({arkit: 1.0})
+        for arkit, shape in found.items()
+        for name in shape.names
+        if spelled_as(name, ARKIT) is None
     }
     if "jawOpen" not in found:  # the mouth opens by vowels
         rules |= {name: ShapeRule(sources) for name in names if (sources := vowel_sources(name))}

@@ -14,7 +14,8 @@ from torchface.io.gltf.part_insertion import ExtendedBlock
 from torchface.io.vrm.vrm_expressions import MorphBind, vrm_expressions
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, arkit_name, recognised_shapes
-from torchface.shape_names.recognised_names import arkit_count, side_written_out
+from torchface.shape_names.arkit_names import side_written_out
+from torchface.shape_names.recognised_names import arkit_count
 from torchface.workflows.rig.character_face import CharacterFace
 
 _LARGEST = 2.0  # times a shape as it was made, to which that of a part may be brought

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+import torch
 from torch import Tensor
 
 from torchface.errors import NameMismatchError
@@ -87,8 +88,8 @@ def character_matrix(names: Sequence[str], shapes: Sequence[str]) -> Tensor:
     matrix = mapping(names, shapes)
     onto = mapping(ARKIT, shapes)
     for column, name in enumerate(names):
-        for shape, weight in (known[name].shapes if name in known else {}).items():
-            matrix[:, column] += weight * onto[:, ARKIT.index(shape)]
+        if name in known:
+            matrix[:, column] = onto @ torch.tensor([known[name].shapes.get(shape, 0.0) for shape in ARKIT])
     if not bool(matrix.any()):
         raise NameMismatchError(
             f"character: found the shapes {', '.join(list(shapes)[:5])}, ..., of which no example "
