@@ -2,6 +2,7 @@
 
 import socket
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -39,6 +40,7 @@ def sent(take: Take, receiver: socket.socket) -> list[float]:
 
     words = stream_take(take, address(receiver), lambda: now[0], wait)
     assert words.startswith(f"{len(take)} frames sent")
+    assert words.endswith("ms)")
     return begun
 
 
@@ -59,6 +61,14 @@ def test_frames_at_uneven_times_go_out_at_these(receiver: socket.socket) -> None
     still = Track(ARKIT, torch.zeros(5, len(ARKIT), 1))
     take = Take(30.0, weights=still, extras={"columns": columns}, seconds=torch.tensor(times))
     assert sent(take, receiver) == pytest.approx(times[1:])
+
+
+def test_frames_that_nobody_receives_are_counted(receiver: socket.socket) -> None:
+    there = address(receiver)
+    receiver.close()
+    take = Take(60.0, weights=Track(ARKIT, torch.zeros(4, len(ARKIT), 1)))
+    take = replace(take, extras={"columns": dict.fromkeys(ROTATIONS, torch.zeros(4))})
+    assert stream_take(take, there).endswith("; 3 were not received: nobody listens there yet")
 
 
 @pytest.mark.parametrize("options", [(), ("--frame-by-frame",)])

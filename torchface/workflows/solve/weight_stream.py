@@ -18,14 +18,16 @@ def stream_take(
     words."""
     assert take.weights is not None
     turns = torch.stack([torch.as_tensor(take.extras["columns"][name]) for name in ROTATIONS], 1).float()
-    latency = []  # from when each frame was due to its packet on the way, milliseconds
+    why, latency = list[str](), []  # from when each frame was due to its packet on the way, milliseconds
     with closing(mapped_sender(address, take.weights.names, take.fps)) as sender:
         begin = clock()
         for weights, turn, due in zip(take.weights.values[..., 0], turns, take.times.tolist(), strict=True):
             if (early := begin + due - clock()) > 0:
                 wait(early)
             came = clock()
-            sender.send(weights, turn)
+            if not sender.send(weights, turn):
+                why.append(sender.problem)
             latency.append(1000 * (clock() - came))
     typical, worst = torch.tensor(latency).quantile(torch.tensor([0.5, 0.99])).tolist()
-    return f"{len(latency)} frames sent, {typical:.2f} ms from frame to packet (99th percentile {worst:.2f} ms)"
+    missed = f"; {len(why)} were not received: {why[-1]}" if why else ""
+    return f"{len(latency)} frames sent, {typical:.2f} ms from frame to packet (99th percentile {worst:.2f} ms){missed}"
