@@ -82,6 +82,9 @@ def test_units_of_ones_own_are_grouped_by_the_labels(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="no frame shows 16, which"):
         found = performed_groups([again])
     assert found == (replace(groups[0], units=("18R",)), groups[1])
+    # A unit that no group classifies may be performed, so that it is not taken for one of theirs.
+    lips = replace(labels, groups=(RegionGroup("lips", ("mouth",), ("18R",), ("15",)),))
+    assert performed_groups([lips]) == lips.groups
     with pytest.raises(NameMismatchError, match="group 'brows' has regions brow and units 4, expected some of mouth"):
         replace(labels, groups=(RegionGroup("brows", ("brow",), ("4",)),))
     with pytest.raises(TorchfaceError, match=r"found the units 15, 18R, expected .*; others need \[\[groups\]\]"):

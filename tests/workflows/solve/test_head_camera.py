@@ -7,11 +7,17 @@ import pytest
 import torch
 
 from torchface import Take, Track, zoo
-from torchface.capture.action_units import ActionUnitClassifier, ActionUnitCurves
+from torchface.capture.action_units import ActionUnitClassifier, ActionUnitCurves, load_shape_table
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.io.action_labels import load_action_labels
 from torchface.workflows.batch.batch_items import BatchItem
-from torchface.workflows.solve.head_camera import HeadCamera, predicted_curves, resampled_curves, video_warnings
+from torchface.workflows.solve.head_camera import (
+    HeadCamera,
+    _fitting_table,
+    predicted_curves,
+    resampled_curves,
+    video_warnings,
+)
 from torchface.workflows.solve.solution import SolveSettings
 from torchface.workflows.solve.take_job import TakeJob
 
@@ -107,6 +113,13 @@ def test_regions_that_the_labels_lack_are_named_with_their_file(tmp_path: Path) 
     camera = HeadCamera(Path("take.mp4"), "action_units", less)
     with pytest.raises(NameMismatchError, match=r"less\.toml: regions: found no eye_left, eye_right, expected .*mouth"):
         predicted_curves(camera, take(2, 60.0), ("jawOpen",))
+
+
+def test_units_of_ones_own_need_a_table_of_their_own() -> None:
+    names = load_shape_table("arkit").units["4"]
+    assert _fitting_table(("4", "mine"), tuple(names)) == "arkit"
+    with pytest.raises(NameMismatchError, match=r"for the units mine, yours of a rig with browDownLeft.*--table FILE"):
+        _fitting_table(("mine", "yours"), tuple(names))
 
 
 def test_a_batch_solves_a_take_again_where_labels_or_classifier_have_changed(tmp_path: Path) -> None:

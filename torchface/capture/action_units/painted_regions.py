@@ -27,7 +27,7 @@ def performed_groups(labels: Sequence[ActionLabels]) -> tuple[RegionGroup, ...]:
     performed = {unit for own in labels for unit in own.units}
     usual = next((own.groups for own in labels if own.groups), GROUPS)
     known = {unit for group in usual for unit in group.units}
-    if not performed or performed - known:
+    if not performed & known or performed - known - {unit for group in usual for unit in group.other_units}:
         found = ", ".join(sorted(performed)) or "none"
         raise NameMismatchError(
             f"labels: found the units {found}, expected some of {', '.join(sorted(known))}; others need [[groups]] in "

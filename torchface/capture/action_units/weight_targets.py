@@ -117,12 +117,11 @@ def action_unit_curves(
     for unit, shown in enumerate(seen.T):
         levels[:, unit] = interpolated(levels[shown, unit], shown.nonzero()[:, 0], len(levels)) if shown.any() else 0.0
     intensities = smooth_intensities(levels, classifier.units, settings.windows, fps=read.fps)
-    weights = (intensities[:, :, None] * matrix).amax(1)
+    weights = (intensities[:, :, None] * matrix).amax(1).clamp(0, 1)
     active = _moved(levels, matrix)
     if settings.at_rest:
         active |= (matrix > 0).any(0) & ~_moved(levels, whole)
     active &= ~_moved(~seen, matrix)
-    weights = weights.clamp(0, 1)
     return ActionUnitCurves(tuple(names), weights, active, classifier.units, intensities, levels, read.fps, seen)
 
 

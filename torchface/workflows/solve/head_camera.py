@@ -142,9 +142,9 @@ def video_warnings(alone: Take, predicted: Predicted) -> list[str]:
 def _fitting_table(units: tuple[str, ...], names: tuple[str, ...]) -> str:
     for name in built_in_tables():
         with suppress(NameMismatchError):
-            load_shape_table(name).matrix(units, names)
-            return name
+            if load_shape_table(name).matrix(units, names).any():
+                return name
     raise NameMismatchError(
-        f"shape table: found no built-in one ({', '.join(built_in_tables())}) for a rig with {', '.join(names[:5])}, "
-        "...; expected one for this rig (--table FILE)"
+        f"shape table: found no built-in one ({', '.join(built_in_tables())}) for the units "
+        f"{', '.join(units)} of a rig with {', '.join(names[:5])}, ...; expected one for them (--table FILE)"
     )
