@@ -4,7 +4,7 @@ import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cache
-from itertools import takewhile
+from os.path import commonprefix
 
 import torch
 from torch import Tensor
@@ -59,14 +59,9 @@ def recognised_shapes(names: Sequence[str]) -> dict[str, RecognisedShape]:
         jawOpen A25_Jaw_Open
         browInnerUp browInnerUp_L browInnerUp_R
     """
-    row: dict[str, int] = {}
-    for number, name in enumerate(names):
-        row.setdefault(name, number)
-    by_words: dict[str, int] = {}
-    for number, name in enumerate(names):
-        arkit = arkit_name(name)
-        if arkit is not None:
-            by_words.setdefault(arkit, number)
+    backwards = [*enumerate(names)][::-1]  # of two alike the first stays
+    row = {name: number for number, name in backwards}
+    by_words = {arkit: number for number, name in backwards if (arkit := arkit_name(name)) is not None}
     found: dict[str, RecognisedShape] = {}
     for arkit in ARKIT:
         rows: tuple[int, ...] = ()
@@ -117,7 +112,7 @@ def _read_as_arkit(names: Sequence[str]) -> tuple[str, ...]:
     """ARKit's name of each that has one, once each; the others without what all names begin or end with, where ARKit's
     shapes have it too and are read without it: in ``eye_up`` and ``eye_down`` it is what the names are about."""
     names = tuple(names)
-    start, end = _beginning(names), _beginning([name[::-1] for name in names])[::-1]
+    start, end = commonprefix(names), commonprefix([name[::-1] for name in names])[::-1]  # noqa: RUF071
     before, after = _SHARED_PREFIX.match(start), _SHARED_SUFFIX.search(end)
     first, last = before.end() if before and len(names) > 1 else 0, len(after[0]) if after and len(names) > 1 else 0
     plain = [name[first : len(name) - last] or name for name in names]
@@ -129,11 +124,6 @@ def _read_as_arkit(names: Sequence[str]) -> tuple[str, ...]:
         arkit = arkit_name(name) or arkit_name(short)
         read.append(short if arkit is None or arkit in read else arkit)
     return tuple(read)
-
-
-def _beginning(names: Sequence[str]) -> str:
-    """The letters that all names begin with."""
-    return "".join(letters[0] for letters in takewhile(lambda row: len(set(row)) == 1, zip(*names, strict=False)))
 
 
 def arkit_count(found: Collection[str], still: Sequence[str]) -> str:

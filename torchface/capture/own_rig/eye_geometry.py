@@ -92,11 +92,8 @@ def _turn(before: Tensor, after: Tensor) -> float:
 
 def arkit_names(names: Sequence[str]) -> list[str]:
     """What ARKit calls each shape; its own name where ARKit knows none."""
-    called = mapping(names, ARKIT)
-    return [
-        ARKIT[int(column.argmax())] if bool(column.any()) else name
-        for name, column in zip(names, called.T, strict=True)
-    ]
+    called = zip(names, mapping(names, ARKIT).T, strict=True)
+    return [ARKIT[int(column.argmax())] if bool(column.any()) else name for name, column in called]
 
 
 def openness_of(landmarks: Tensor) -> Tensor:

@@ -79,11 +79,7 @@ class RigViewer(BrowserPage):
 
     def set_weight(self, name: str, value: float) -> int:
         """Moves a shape in the frame in view, with symmetric editing its twin too; returns the pieces sent."""
-        with self._lock:
-            if self.playback.playing:
-                self._pause()
-            self.editor.set(name, value)
-            return self._show()
+        return self._edit(partial(self.editor.set, name, value))
 
     def save(self) -> Path:
         """Writes the weights as they stand now."""
@@ -225,12 +221,12 @@ class RigViewer(BrowserPage):
         self.playback = self.playback.seek(frame, time.monotonic())
         self.show_frame(self.playback.origin)
 
-    def _edit(self, action: Callable[[], None]) -> None:
+    def _edit(self, action: Callable[[], object]) -> int:
         with self._lock:
             if self.playback.playing:
                 self._pause()
             action()
-            self._show()
+            return self._show()
 
 
 GROUPS = ("brows", "eyes", "jaw", "mouth", "cheeks", "nose", "other")
