@@ -264,6 +264,16 @@ def test_bad_input_is_named(people: tuple[Tensor, Tensor]) -> None:
         fit(neutrals, expressions, ExpressionSettings(neutral_components=0))
     with pytest.raises(ShapeError, match=r"expected \(B,40,3\)"):
         fit(neutrals, expressions)(neutrals[:, 1:])
+    with pytest.raises(ShapeError, match=r"expected \(B,40,3\)"):
+        fit(neutrals, expressions).distance(neutrals[:, 1:])
+    with pytest.raises(ShapeError, match=r"found \(24, 0, 40, 3\)"):
+        fit(neutrals, expressions[:, :0])
+
+
+def test_people_may_be_arrays_or_parts_of_a_graph(people: tuple[Tensor, Tensor]) -> None:
+    wanted = ExpressionRegression.fit(*people)
+    for given in ([x.numpy() for x in people], [x.clone().requires_grad_() for x in people]):
+        assert torch.equal(ExpressionRegression.fit(*given).coefficients, wanted.coefficients)
 
 
 @pytest.mark.real

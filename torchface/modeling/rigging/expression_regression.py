@@ -217,8 +217,6 @@ class ExpressionRegression(nn.Module):
     @full_precision
     def offsets(self, neutrals: Tensor) -> Tensor:
         """How far each vertex goes in each expression, (B,N,V,3); see :meth:`forward`."""
-        if neutrals.ndim != 3 or neutrals.shape[1:] != self.neutral_mean.shape:
-            raise ShapeError(f"neutrals: found {tuple(neutrals.shape)}, expected (B,{len(self.neutral_mean)},3)")
         neutrals = as_real(neutrals, "neutrals")
         pose = self._pose(neutrals)
         aligned = pose.apply(neutrals)
@@ -250,6 +248,8 @@ class ExpressionRegression(nn.Module):
         return ((X / deviations[:-1]).square().mean(1) + left / deviations[-1] ** 2).sqrt()
 
     def _pose(self, neutrals: Tensor) -> Similarity:
+        if neutrals.ndim != 3 or neutrals.shape[1:] != self.neutral_mean.shape:
+            raise ShapeError(f"neutrals: found {tuple(neutrals.shape)}, expected (B,{len(self.neutral_mean)},3)")
         return similarity_transform(neutrals, self.neutral_mean.to(neutrals).expand_as(neutrals), scale=False)
 
     def _beyond(self, aligned: Tensor) -> Tensor:

@@ -11,6 +11,7 @@ from torchface.geometry.sample_batches import Samples, SamplesInMemory, blocks
 from torchface.modeling.morphable.principal_components import PrincipalComponents, principal_components
 from torchface.modeling.rigging.expression_regression import STILL, ExpressionRegression, ExpressionSettings, Form
 from torchface.modeling.rigging.people_together import MovingPlaces, NeutralRegion, Predicted, align_neutrals
+from torchface.number_checks import as_tensor
 from torchface.optim.eigenpairs import largest_eigenpairs
 from torchface.progress import Progress, silent
 
@@ -140,21 +141,25 @@ def _people(
     neutrals: Tensor | Samples, expressions: Tensor | Samples, names: Sequence[str] | None
 ) -> tuple[Samples, Samples, list[str]]:
     """People as samples (M,V,3) and (M,N·V,3), and the names of the N expressions; refuses what does not fit."""
-    count, vertices = neutrals.shape[0], neutrals.shape[1] if len(neutrals.shape) > 1 else 0
-    if len(neutrals.shape) != 3 or neutrals.shape[2] != 3 or count < 2:
+    if not hasattr(neutrals, "read"):
+        neutrals = SamplesInMemory(as_tensor("neutrals", neutrals, "(M,V,3)").detach())
+    if len(neutrals.shape) != 3 or neutrals.shape[2] != 3 or neutrals.shape[0] < 2:
         raise ShapeError(f"neutrals: found {tuple(neutrals.shape)}, expected (M,V,3) of at least two people")
-    found = tuple(expressions.shape)
-    if isinstance(expressions, Tensor):
-        if found[:1] + found[2:] != (count, vertices, 3):
+    count, vertices, _ = neutrals.shape
+    if not hasattr(expressions, "read"):
+        expressions = as_tensor("expressions", expressions, "(M,N,V,3)").detach()
+        found = tuple(expressions.shape)
+        if found[:1] + found[2:] != (count, vertices, 3) or 0 in found:
             raise ShapeError(f"expressions: found {found}, expected ({count},N,{vertices},3)")
         expressions = SamplesInMemory(expressions.flatten(1, 2))
-    elif len(found) != 3 or (found[0], found[1] % vertices, found[2]) != (count, 0, 3):
+    found = tuple(expressions.shape)
+    if len(found) != 3 or (found[0], found[1] % vertices, found[2]) != (count, 0, 3):
         raise ShapeError(f"expressions: found {found}, expected ({count},N·{vertices},3)")
     shown = expressions.shape[1] // vertices
     names = [f"expression{i}" for i in range(shown)] if names is None else list(names)
     if len(names) != shown:
         raise NameMismatchError(f"names: found {len(names)}, expected one for each of {shown}")
-    return SamplesInMemory(neutrals) if isinstance(neutrals, Tensor) else neutrals, expressions, names
+    return neutrals, expressions, names
 
 
 RIDGES = (0.0, 1e-3, 1e-2, 1e-1)
