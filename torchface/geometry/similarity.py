@@ -7,6 +7,7 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, ShapeError, ValueRangeError
 from torchface.geometry.rotations import cross_matrix
+from torchface.number_checks import as_real
 
 __all__ = ["Similarity", "similarity_transform"]
 
@@ -31,11 +32,13 @@ class Similarity:
 
     def apply(self, points: Tensor) -> Tensor:
         """Moved points (B,N,3); points (N,3) go through each of the B similarities."""
+        points = as_real(points, "points")
         rotated = points @ self.rotation.transpose(-1, -2).to(points)
         return self.scale.to(points)[:, None, None] * rotated + self.translation.to(points)[:, None, :]
 
     def apply_vectors(self, vectors: Tensor) -> Tensor:
         """Rotated and scaled, not translated: for deltas (..., B,N,3)."""
+        vectors = as_real(vectors, "vectors")
         return self.scale.to(vectors)[:, None, None] * (vectors @ self.rotation.transpose(-1, -2).to(vectors))
 
     def __getitem__(self, rows: Tensor | slice) -> "Similarity":
@@ -94,6 +97,7 @@ def similarity_transform(
         >>> round(found.scale.item(), 3), found.translation.round(decimals=3).tolist()
         (10.0, [[3.0, 3.0, 3.0]])
     """
+    source, target = as_real(source, "source"), as_real(target, "target")
     if source.shape != target.shape or source.ndim != 3 or source.shape[-1] != 3:
         raise ShapeError(
             f"similarity_transform: found {tuple(source.shape)} and {tuple(target.shape)}, expected (B,N,3) twice"
@@ -125,5 +129,4 @@ def similarity_transform(
     rotation = (u * sign[..., None, :]) @ vh
     s = (sign * singular).sum(-1) / (w * x.square()).sum((-1, -2)) if scale else torch.ones_like(singular[..., 0])
     translation = mean_y[..., 0, :] - s[..., None] * (rotation @ mean_x.transpose(-1, -2))[..., 0]
-    dtype = source.dtype
-    return Similarity(s.to(dtype), rotation.to(dtype), translation.to(dtype))
+    return Similarity(*(found.to(source) for found in (s, rotation, translation)))

@@ -116,6 +116,15 @@ def test_nothing_is_learned_from_what_transfer_already_gives(template: Blendshap
     assert float(made.angles.max()) < 1e-3
 
 
+def test_weights_may_be_whole_numbers_or_arrays(template: BlendshapeRig, person: BlendshapeRig) -> None:
+    weights = torch.eye(3, dtype=torch.float64)
+    shown = person(weights)
+    wanted = rig_from_examples(template, person.neutral, shown, weights, SHORT)
+    for given in ((shown, weights.long()), (shown.numpy(), weights.numpy())):
+        made = rig_from_examples(template, person.neutral, *given, SHORT)
+        torch.testing.assert_close(made.weights.double(), wanted.weights, rtol=0, atol=1e-6)
+
+
 def test_wrong_weights_are_put_right(template: BlendshapeRig, person: BlendshapeRig) -> None:
     truth = torch.tensor([[0.8, 0.0, 0.5], [0.3, 0.6, 0.0], [0.0, 0.4, 0.9]], dtype=torch.float64)
     transferred = transfer_with_report(template, person.neutral).rig

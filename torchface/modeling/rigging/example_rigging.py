@@ -14,7 +14,7 @@ from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import CONTACT_WEIGHT, TransferReport, transfer_report
 from torchface.modeling.rigging.example_gradients import example_shares, personal_part, shape_stiffness
 from torchface.modeling.rigging.transfer_system import ShapeTransfer
-from torchface.number_checks import LARGEST_WEIGHT, checked_count, checked_number
+from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_count, checked_number
 from torchface.optim import box_qp
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
@@ -157,6 +157,7 @@ def rig_from_examples(
         True
     """
     progress = progress or silent
+    examples, weights = as_real(examples, "examples"), as_real(weights, "weights")
     _check(template, neutral, examples, weights, contact_weight)
     job = _Rigging(template, neutral, examples, weights, schedule or RiggingSchedule(), contact_weight)
     for number in range(job.schedule.iterations):

@@ -95,6 +95,7 @@ def test_light_contrast_and_place_do_not_matter() -> None:
     torch.testing.assert_close(model(0.3 + 0.4 * picture, box), found, rtol=0, atol=1e-3)
     moved = model(picture.roll((3, -5), (2, 3)), box + torch.tensor([-5.0, 3, 0, 0]))
     torch.testing.assert_close(moved, found + torch.tensor([-5.0, 3]), rtol=0, atol=1e-3)
+    torch.testing.assert_close(model(picture.double(), box.double()), found, rtol=0, atol=1e-3)
     lost = model(picture.expand(2, 1, 90, 90), torch.cat([box, box * torch.nan]))
     assert torch.isnan(lost[1]).all()
     torch.testing.assert_close(lost[:1], found)

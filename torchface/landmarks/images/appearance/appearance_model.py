@@ -182,7 +182,7 @@ class AppearanceModel(nn.Module):
 
         Raises:
             ShapeError: images and landmarks do not fit each other, or fewer than three images.
-            ValueRangeError: a landmark is NaN, infinite or far outside its image, or all shapes are the same.
+            ValueRangeError: a landmark is NaN, infinite or far outside its image, or all faces look the same.
         """
         from torchface.landmarks.images.appearance.appearance_training import learn_appearance
 

@@ -106,6 +106,8 @@ def _learn_textures(model: AppearanceModel, level: AppearanceLevel, textures: Te
         rows = slice(part * (len(textures) - 1), (part + 1) * (len(textures) - 1))
         flat = (centred[:, 0] * mask).flatten(1)
         gram = flat @ flat.T
+        if not bool(gram.any()):
+            raise ValueRangeError("images: found faces that all look the same, expected some that differ")
         values, vectors = torch.linalg.eigh(gram)
         values, vectors = values.flip(0)[:-1], vectors.flip(1)[:, :-1]
         scaled = torch.where(values > _RANK * values[0], values.clamp(min=1e-30).rsqrt(), 0.0)

@@ -186,7 +186,7 @@ class LandmarkTrees(nn.Module):
         for cascade in range(self.sizes["cascades"]):  # each starts where the one before ended
             rotation = similarity_to(self.mean, shapes)
             pixels = shapes[:, self.anchors[cascade]] + self.offsets[cascade] @ rotation.transpose(1, 2)
-            step = self._step(cascade, read_grey(images, pixels)).view(-1, *self.mean.shape)
+            step = self._step(cascade, read_grey(images, pixels).to(shapes)).view(-1, *self.mean.shape)
             shapes = shapes + step @ rotation.transpose(1, 2)
         return shapes
 
