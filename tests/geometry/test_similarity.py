@@ -40,6 +40,14 @@ def test_agrees_with_scipy_where_noise_leaves_a_residual() -> None:
     assert float(found.scale[0]) == 1.0
 
 
+def test_whole_numbers_count_as_they_are() -> None:
+    points = planted(1)[0].round()
+    found = similarity_transform(points.long(), 1.5 * points + 0.5)
+    torch.testing.assert_close(found.rotation[0], torch.eye(3), rtol=0, atol=1e-6)
+    for apply, shift in ((found.apply, 0.5), (found.apply_vectors, 0.0)):
+        torch.testing.assert_close(apply(points.long()).double(), 1.5 * points + shift, rtol=0, atol=1e-3)
+
+
 def test_mirrored_points_give_a_rotation() -> None:
     points, *_ = planted(1)
     found = similarity_transform(points, points * torch.tensor([-1.0, 1, 1]).double())

@@ -156,9 +156,9 @@ def bake_normal_map(
             f"mesh: no texel's centre of {height} x {width} lies in a triangle; expected uvs within the unit square "
             "and a larger size"
         )
-    vertices = mesh.vertices.double()
+    vertices = mesh.vertices.detach().double()
     space = tangent_space(vertices, mesh.faces, uvs.double(), uv_faces, vertex_normals(vertices, mesh.faces))
-    scan = _Surface.of(high_resolution_scan.vertices.double(), high_resolution_scan.faces, alignment)
+    scan = _Surface.of(high_resolution_scan.vertices.detach().double(), high_resolution_scan.faces, alignment)
     cosine = float(torch.tensor(settings.maximum_angle).deg2rad().cos())
     normals, offset, opposed = _cast_all(vertices, space, texels, scan, settings.maximum_distance, cosine)
     seen = torch.isfinite(offset)
