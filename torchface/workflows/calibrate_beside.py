@@ -79,7 +79,7 @@ def calibrate_beside(
 def _seen_at_once(one: Path, other: Path, views: dict[int, View], board: Board) -> tuple[list[Tensor], list[Tensor]]:
     """Corners (N,2) of the board in views of one film by their frames, and in another film at these moments."""
     (rate, start), (other_rate, other_start) = ((open_video(film).fps, start_of(film)) for film in (one, other))
-    begin = 0.0 if start is None or other_start is None else other_start - start
+    begin = 0.0 if start is None or other_start is None else (other_start - start + 43200) % 86400 - 43200
     wanted = {round((number / rate - begin) * other_rate): view for number, view in views.items()}
     first, then = [], []
     for number, frame in enumerate(open_video(other).frames()):

@@ -128,8 +128,9 @@ def test_the_command_line_takes_a_film_of_each_camera(
     assert float((found - performed(torch.arange(frames) / rate)[2:]).abs().mean()) < 0.12
 
 
-def test_films_are_brought_together_by_timecodes(ready: TrackInputs, tmp_path: Path) -> None:
-    for name, begin in (("left", "10:00:00:00"), ("right", "10:00:01:15")):
+@pytest.mark.parametrize("begins", [("10:00:00:00", "10:00:01:15"), ("23:59:59:15", "00:00:01:00")])
+def test_films_are_brought_together_by_timecodes(begins: tuple[str, str], ready: TrackInputs, tmp_path: Path) -> None:
+    for name, begin in zip(("left", "right"), begins, strict=True):
         with av.open(str(tmp_path / f"{name}.mov"), "w") as container:
             stream = container.add_stream("mpeg4", rate=Fraction(30))
             stream.width, stream.height, stream.metadata["timecode"] = 160, 120, begin

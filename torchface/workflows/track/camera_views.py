@@ -127,7 +127,7 @@ def _begins(cameras: tuple[PlacedCamera, ...], films: list[Path], file: Path) ->
         if camera.offset is not None:
             begins.append(camera.offset - (cameras[0].offset or 0.0))
         elif start is not None and starts[0] is not None:
-            begins.append(start - starts[0])
+            begins.append((start - starts[0] + 43200) % 86400 - 43200)  # midnight may lie between
         else:
             begins.append(0.0)
             silent.append(camera.name)
