@@ -106,9 +106,8 @@ def retarget_weights(
 
 def _unmatched(weights: Track, shapes: ShapeMap, source: Path, target: Path) -> list[str]:
     """What to say where most of what moves drives nothing."""
-    moving = {
-        name for name, moves in zip(weights.names, (weights.values.nan_to_num() != 0).any(0), strict=True) if moves
-    }
+    moves = (weights.values.nan_to_num() != 0).any(0)
+    moving = {name for name, moved in zip(weights.names, moves, strict=True) if moved}
     lost = moving & set(shapes.unused)
     if 2 * len(lost) <= len(moving):
         return []

@@ -1,5 +1,6 @@
 """Models by name serve rigs of ARKit's shapes in any spelling; others are told."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -7,11 +8,13 @@ import torch
 from torch.nn.functional import interpolate
 
 from torchface import BlendshapeRig, zoo
+from torchface.capture.own_rig import VideoSettings, VideoSolver
 from torchface.capture.priors import ShapePrior
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.landmarks.images.ibug_68 import MIRROR_68
 from torchface.shape_names import ARKIT, mirror
 from torchface.synthetic import performer
+from torchface.workflows.named_priors import DEFAULT_PRIOR, load_priors
 from torchface.workflows.track.track_models import load_track_models
 
 
@@ -50,3 +53,17 @@ def test_a_face_in_a_mirror_is_read_as_the_mirror_image_of_it() -> None:
     mirrored = across.landmarks[list(MIRROR_68)] * torch.tensor([-1.0, 1.0]) + torch.tensor([319.0, 0.0])
     torch.testing.assert_close(seen.landmarks, mirrored, atol=0.05, rtol=0)
     torch.testing.assert_close(seen.expression, across.expression[mirror(ARKIT)], atol=1e-3, rtol=0)
+
+
+def test_a_rig_named_as_in_maya_is_solved_with_the_same_prior_and_lids() -> None:
+    rig = performer(texture=False)
+    names = ["bs." + re.sub("(.*)(L|R)(eft|ight)$", r"\2_\1", name) for name in rig.names]
+    priors, walks = [], []
+    for one in (rig, BlendshapeRig(rig.neutral, rig.deltas, names)):
+        priors.append(load_priors(one, DEFAULT_PRIOR, None).shapes.state_dict())
+        walks.append(VideoSolver(one, None, torch.eye(3), settings=VideoSettings(motion=1.0)).walk_variance)
+    ours, theirs = priors
+    assert ours.keys() == theirs.keys()
+    assert all(torch.equal(value, theirs[key]) for key, value in ours.items() if isinstance(value, torch.Tensor))
+    assert torch.equal(*walks)
+    assert len(set(walks[0].tolist())) == 2  # lids are quick

@@ -21,6 +21,7 @@ from torchface.errors import FileFormatError, NameMismatchError, ShapeError, Val
 from torchface.files.documents import Value
 from torchface.number_checks import as_tensor, checked_type
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import arkit_name
 
 CONTOUR_WEIGHT = 0.5
 ROTATION_STEP, TRANSLATION_STEP = 0.02, 4.0
@@ -116,6 +117,7 @@ class VideoSolverParts(nn.Module):
         count = len(names)
         # Nothing is expected of weights that no dynamics prior leads to, next to nothing of a first frame's.
         weight = 0.0 if dynamics is None else INITIAL_WEIGHT**-2
+        lids = [_LIDS.match(arkit_name(name) or name) for name in names]
         constants = {
             "lower": [0.0] * count + [-torch.inf] * 6,
             "upper": [1.0] * count + [torch.inf] * 6,
@@ -123,7 +125,7 @@ class VideoSolverParts(nn.Module):
             "initial_information": [weight] * count + [INITIAL_ROTATION**-2] * 3 + [INITIAL_TRANSLATION**-2] * 3,
             "l1_penalty": [settings.sparsity] * count + [0.0] * 6,
             "ridge": [2 * settings.ridge] * count + [0.0] * 6,
-            "walk_variance": [(settings.motion * (_LID_MOTION if _LIDS.match(n) else 1.0)) ** 2 for n in names],
+            "walk_variance": [(settings.motion * (_LID_MOTION if lid else 1.0)) ** 2 for lid in lids],
         }
         for name, numbers in constants.items():
             made = torch.tensor(numbers, dtype=torch.float64, device=device)

@@ -24,8 +24,7 @@ class WeightEditor:
 
     Args:
         spread: frames on each side that an edit takes along.
-        symmetric: an edit of a left shape sets its right twin to the same value, and the other way round; not of one
-            that undoes it, such as ``jawLeft``.
+        symmetric: an edit of a left shape sets its right twin too, and the other way round; ``jawLeft`` has none.
     """
 
     def __init__(
@@ -66,11 +65,6 @@ class WeightEditor:
     def pose(self) -> Tensor:
         """Weights (N,) of the frame in view."""
         return self.weights[self._frame]
-
-    @property
-    def edited(self) -> bool:
-        """Whether anything differs from what was loaded."""
-        return not torch.equal(self.weights, self._loaded)
 
     def set(self, name: str, value: float) -> tuple[str, ...]:
         """Moves one shape, or with ``symmetric`` both twins, in the frame in view; returns the names that were set."""
