@@ -35,7 +35,11 @@ def test_every_model_that_ships_is_of_the_class_that_its_overload_says() -> None
 
 
 def test_a_model_of_another_class_is_refused_by_both_names(tmp_path: Path) -> None:
-    zoo.save_model(zoo.get_model("shape_prior"), tmp_path / "mine", zoo.ModelCard("MIT", "none", {}, "none"))
+    zoo.save_model(
+        zoo.get_model("shape_prior"),
+        tmp_path / "mine",
+        zoo.ModelCard("MIT", "none", {"error": torch.tensor(0.5)}, "none"),
+    )
     assert type(zoo.get_model(tmp_path / "mine", ShapePrior)) is ShapePrior
     assert type(zoo.get_model(tmp_path / "mine", torch.nn.Module)) is ShapePrior
     with pytest.raises(NameMismatchError, match=r"found .*mine, a ShapePrior, expected a MorphableModel"):

@@ -16,6 +16,7 @@ from torchface.errors import FileFormatError, TorchfaceError, ValueRangeError
 from torchface.files.documents import read_toml, write_toml
 from torchface.files.state_renames import current_config, current_state_keys
 from torchface.files.whole_files import all_or_none, made_folder, read_file, write_file
+from torchface.number_checks import checked_number
 
 FORMAT = 1
 DESCRIPTION, STATE, CARD = "model.toml", "state.safetensors", "CARD.md"
@@ -49,12 +50,11 @@ def write_model(
         card: Markdown for ``CARD.md``: what the model is good for, measured how, its limits.
         half: names in the state that are stored in half precision.
     """
-    odd = [name for name, value in record.metrics.items() if not math.isfinite(value)]
-    if odd:
-        raise ValueRangeError(f"metrics: found {odd[0]} = {record.metrics[odd[0]]}, expected finite numbers")
+    metrics = {name: checked_number(f"metrics.{name}", value, -math.inf) for name, value in record.metrics.items()}
     folder = Path(folder)
     state = pack_state(model.state_dict(), half)
-    record = replace(record, sha256=hashlib.sha256(state).hexdigest(), size=len(state), config=dict(model.config))  # type: ignore[arg-type]
+    found = {"sha256": hashlib.sha256(state).hexdigest(), "size": len(state), "config": dict(model.config)}  # type: ignore[arg-type]
+    record = replace(record, metrics=metrics, **found)
     with made_folder(folder), all_or_none():
         write_file(folder / STATE, state)
         write_file(folder / CARD, card_text(folder.name, record, card).encode())

@@ -1,5 +1,6 @@
 """Densities against scikit-learn and scipy, their quadratics against finite differences."""
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,8 @@ from scipy.stats import multivariate_t
 from sklearn.cluster import estimate_bandwidth
 from torch import Tensor
 
-from torchface.capture import DynamicsPrior, ShapePrior
+from torchface import zoo
+from torchface.capture import DynamicsPrior, DynamicsSettings, ShapePrior
 from torchface.capture.priors import ParzenDensity, ReciprocalPrior, StudentDensity, automatic_bandwidth, face_halves
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 
@@ -24,6 +26,21 @@ def clusters(frames: int = 600, seed: int = 0) -> Tensor:
     member = torch.randint(3, (frames,), generator=generator)
     noise = torch.randn(frames, 5, generator=generator, dtype=torch.float64)
     return centers[member] + torch.einsum("tde,te->td", spread[member], noise)
+
+
+def test_takes_and_groups_may_be_numpys(tmp_path: Path) -> None:
+    x = clusters(300)
+    groups = [np.array([0, 1]), np.array([2, 3, 4])]
+    learned = ShapePrior.fit([x.numpy()], NAMES, groups)
+    zoo.save_model(learned, tmp_path / "prior", zoo.ModelCard("MIT", "none", {}, "none"))
+    kept = zoo.get_model(tmp_path / "prior", ShapePrior)
+    wanted = ShapePrior.fit([x], NAMES, [(0, 1), (2, 3, 4)])
+    torch.testing.assert_close(kept.log_density(x), wanted.log_density(x))
+    quick = DynamicsSettings(inducing=8, subset=60, iterations=1)
+    fitted = [DynamicsPrior.fit([take], NAMES, 2, groups=groups, settings=quick) for take in (x, x.numpy())]
+    assert torch.equal(fitted[0].processes.weights, fitted[1].processes.weights)
+    assert fitted[1].groups == ((0, 1), (2, 3, 4))
+    assert all(type(row) is int for group in fitted[1].groups for row in group)
 
 
 def test_the_bandwidth_is_scikit_learns() -> None:

@@ -141,7 +141,7 @@ class DynamicsPrior(nn.Module):
                 raise ShapeError(f"dynamics prior: found {name} {tuple(value.shape)}, expected {shape}")
             self.register_buffer(name, value.detach())
         self.names, self.window, self.fps = tuple(names), window, float(fps)
-        self.groups = tuple(tuple(group) for group in groups)
+        self.groups = tuple(tuple(map(int, group)) for group in groups)
         self.input_noise = float(input_noise)
         self.processes, self.noise = processes, noise
         index = {row: i for i, group in enumerate(self.groups) for row in group}

@@ -97,7 +97,7 @@ class ShapePrior(nn.Module):
                 f"shape prior: found {len(densities)} densities of {len(groups)} groups, expected one each, and every "
                 f"one of {len(names)} shapes in one group"
             )
-        self.names, self.groups = tuple(names), tuple(tuple(group) for group in groups)
+        self.names, self.groups = tuple(names), tuple(tuple(map(int, group)) for group in groups)
         self.strength = _checked_strength(strength)
         self.densities = nn.ModuleList(densities)
 

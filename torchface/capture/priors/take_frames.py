@@ -24,7 +24,7 @@ class TakeFrames:
         """Those of each take, (T,D) float64; takes of fewer than two are left out."""
         if not len(self.takes):
             raise ShapeError(f"prior: found no takes, expected (T,{self.shapes}) each")
-        for take in self.takes:
+        for take in map(torch.as_tensor, self.takes):
             if take.ndim != 2 or take.shape[1] != self.shapes:
                 raise ShapeError(f"prior: found takes of {tuple(take.shape)}, expected (T,{self.shapes}) each")
             seen = take.detach().double()[torch.isfinite(take).all(1)]

@@ -53,7 +53,7 @@ class TakeWindows:
         """One after the other; where draws are to go on after the last part ``generator`` draws the noise."""
         generator = torch.Generator().manual_seed(self.seed) if generator is None else generator
         begin = 0
-        for number, take in enumerate(self.takes):
+        for number, take in enumerate(map(torch.as_tensor, self.takes)):
             pair = windows_of(take.detach().double().cpu(), self.window)
             alone = len(self.takes) == 1
             pairs = zip(*(half.chunk(FOLDS) for half in pair), strict=True) if alone else iter([pair])
