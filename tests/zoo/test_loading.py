@@ -35,11 +35,8 @@ def test_every_model_that_ships_is_of_the_class_that_its_overload_says() -> None
 
 
 def test_a_model_of_another_class_is_refused_by_both_names(tmp_path: Path) -> None:
-    zoo.save_model(
-        zoo.get_model("shape_prior"),
-        tmp_path / "mine",
-        zoo.ModelCard("MIT", "none", {"error": torch.tensor(0.5)}, "none"),
-    )
+    card = zoo.ModelCard("MIT", "none", {"error": torch.tensor(0.5)}, "none")
+    assert zoo.save_model(zoo.get_model("shape_prior"), tmp_path / "mine", card).metrics == {"error": 0.5}
     assert type(zoo.get_model(tmp_path / "mine", ShapePrior)) is ShapePrior
     assert type(zoo.get_model(tmp_path / "mine", torch.nn.Module)) is ShapePrior
     with pytest.raises(NameMismatchError, match=r"found .*mine, a ShapePrior, expected a MorphableModel"):

@@ -53,8 +53,8 @@ def write_model(
     metrics = {name: checked_number(f"metrics.{name}", value, -math.inf) for name, value in record.metrics.items()}
     folder = Path(folder)
     state = pack_state(model.state_dict(), half)
-    found = {"sha256": hashlib.sha256(state).hexdigest(), "size": len(state), "config": dict(model.config)}  # type: ignore[arg-type]
-    record = replace(record, metrics=metrics, **found)
+    sha256, config = hashlib.sha256(state).hexdigest(), dict(model.config)  # type: ignore[arg-type]
+    record = replace(record, metrics=metrics, sha256=sha256, size=len(state), config=config)
     with made_folder(folder), all_or_none():
         write_file(folder / STATE, state)
         write_file(folder / CARD, card_text(folder.name, record, card).encode())
