@@ -141,7 +141,7 @@ def least_in_box(
             free = (weights > lower) & (weights < upper)
             weights = attach_gradients(part.gradient, weights, free)
         parts.append(weights)
-    return torch.cat(parts) if parts else start
+    return torch.cat(parts)
 
 
 def _descended(energy: CorrectiveEnergy, start: Tensor, lower: Tensor, upper: Tensor, tolerance: float) -> Tensor:

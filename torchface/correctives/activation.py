@@ -117,7 +117,7 @@ class CorrectiveActivation(nn.Module):
             mode="sum",
             per_sample_weights=values.flatten()[taken],
         )
-        return summed.view(count, self.shapes, -1)
+        return summed.view(count, self.shapes, matrix.shape[-1])
 
     def slope(self, derivative: Tensor, by_activation: Tensor) -> Tensor:
         """By the weights, (B,N), what falls by the activations as (B,C); differentiable."""

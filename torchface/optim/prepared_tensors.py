@@ -23,12 +23,12 @@ class Prepared(Generic[Value]):
     """
 
     def __init__(self) -> None:
-        self._inputs: tuple[Tensor | float, ...] | None = None
+        self._inputs: tuple[Tensor | float, ...] = ()
         self._value: Value | None = None
 
     def get(self, inputs: tuple[Tensor | float, ...], compute: Callable[[], Value]) -> Value:
         """The value of ``compute``, called without gradients where an input's type, device or any entry has changed."""
-        if self._inputs is None or not all(map(_same, self._inputs, inputs)):
+        if len(self._inputs) != len(inputs) or not all(map(_same, self._inputs, inputs)):
             with torch.no_grad():
                 self._value = compute()
                 self._inputs = tuple(x.detach().clone() if isinstance(x, Tensor) else x for x in inputs)

@@ -62,6 +62,8 @@ def test_planted_weights_come_back(rig: BlendshapeRig, attachment: Attachment, t
     assert solver.without_correctives().activation is None
     assert solver.activation is not None
     torch.testing.assert_close(solver.points(truth), markers)
+    for one in (solver, solver.without_correctives(), solver):  # what is kept of one is not another's
+        torch.testing.assert_close(one.complete_energy(markers).value(truth), one.energy(markers).value(truth))
 
 
 def test_gaps_guesses_and_batches_change_nothing(
@@ -75,6 +77,7 @@ def test_gaps_guesses_and_batches_change_nothing(
     one_by_one = torch.cat([solver(frame) for frame in markers.split(1)])
     assert (whole - one_by_one).abs().max() < 1e-8
     assert (whole - solver(markers, truth)).abs().max() < 1e-6
+    assert solver(markers[:0]).shape == (0, SHAPES)
 
 
 def test_scipy_finds_nothing_better_nearby(
