@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from torchface import Attachment, BlendshapeRig
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.mesh import Annotations, Mesh, fan_triangulation, submesh
 
@@ -46,6 +47,16 @@ def test_part_keeps_positions_seams_and_masks() -> None:
     assert torch.equal(ids[part.annotations.landmarks], torch.tensor([1, 2]))
     assert part.annotations.mirror is None  # its other half is gone
     assert part.annotations.contacts.tolist() == [[1, 2]]
+
+
+def test_vertices_of_whole_numbers_are_positions_like_others() -> None:
+    sheet = grid()
+    whole = sheet.with_vertices(sheet.vertices.long())
+    assert torch.equal(whole.vertices, sheet.vertices)
+    posed = BlendshapeRig(whole, torch.full((1, 12, 3), 0.75), ["up"])(torch.tensor([[0.5]]))
+    torch.testing.assert_close(posed[0], sheet.vertices + 0.375)
+    middle = Attachment(torch.tensor([0]), torch.tensor([[0.5, 0.25, 0.25]]))
+    assert torch.equal(middle.on(whole.faces, sheet.vertices.long()), middle.on(sheet.faces, sheet.vertices))
 
 
 def test_a_mesh_without_vertices_is_refused() -> None:

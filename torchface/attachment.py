@@ -20,7 +20,7 @@ from torchface.errors import (
 from torchface.files.documents import read_json, write_json
 from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh, other_topology
-from torchface.number_checks import as_tensor, checked_type
+from torchface.number_checks import as_real, as_tensor, checked_type
 
 _FORMAT = "torchface.attachment/1"
 _MAX_FILE = 64 * 2**20
@@ -157,9 +157,9 @@ class Attachment:
 
     def on(self, faces: Tensor, vertices: Tensor) -> Tensor:
         """The points (...,M,3) on ``vertices`` (...,V,3); linear, so deltas go in as well as positions."""
+        vertices = as_real(vertices, "vertices")
         corners = faces[self.triangles.to(faces.device)]
-        weights = self.barycentric.to(vertices)
-        return (vertices[..., corners, :] * weights[..., None]).sum(-2)
+        return (vertices[..., corners, :] * self.barycentric.to(vertices)[..., None]).sum(-2)
 
     def select(self, labels: Sequence[str]) -> "Attachment":
         """The markers of these labels, in this order."""

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.trimesh_conversion import from_trimesh, to_trimesh
-from torchface.number_checks import as_tensor, checked_type
+from torchface.number_checks import as_real, as_tensor, checked_type
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -115,6 +115,7 @@ class Mesh:
             value = getattr(self, name)
             if not isinstance(value, Tensor) and (value is not None or name in ("vertices", "faces")):
                 object.__setattr__(self, name, as_tensor(name, value, shape, dtype or torch.get_default_dtype()))
+        object.__setattr__(self, "vertices", as_real(self.vertices))
         if self.annotations is not None:
             checked_type("annotations", self.annotations, Annotations)
         _check_shape("vertices", self.vertices, (None, 3))

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.temporal import savitzky_golay
+from torchface.temporal import KalmanSettings, adaptive_filter, adaptive_smoother, kalman_smoother, savitzky_golay
 
 
 @pytest.mark.parametrize(("frames", "window", "order"), [(40, 15, 2), (15, 15, 2), (9, 5, 3), (31, 21, 0)])
@@ -23,6 +23,14 @@ def test_a_gap_spoils_the_windows_that_hold_it_and_no_others() -> None:
     values = torch.rand(60, 1, generator=torch.Generator().manual_seed(0))
     values[30] = torch.nan
     assert savitzky_golay(values, 15).isnan().nonzero()[:, 0].tolist() == list(range(23, 38))
+
+
+def test_whole_numbers_are_smoothed_as_they_are() -> None:
+    pixels = torch.randint(0, 9, (12, 2, 3), generator=torch.Generator().manual_seed(0))
+    settings = KalmanSettings(measurement=0.3, jerk=20.0)
+    smoothers = (lambda x: savitzky_golay(x, 5), adaptive_filter, adaptive_smoother)
+    for smooth in (*smoothers, lambda x: kalman_smoother(x, settings)):
+        torch.testing.assert_close(smooth(pixels), smooth(pixels.float()))
 
 
 def test_a_parabola_stays_as_it_is() -> None:

@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.number_checks import as_real
 from torchface.temporal.kalman import KalmanFilter, KalmanSettings, kalman_smoother
 
 
@@ -147,7 +148,7 @@ def adaptive_filter(
         >>> bool(adaptive_filter(noisy)[50:].std() < 0.5 * noisy[50:].std())
         True
     """
-    _check(values)
+    values = _checked(values)
     running = AdaptiveFilter(values.shape[1], values.shape[2], settings)
     # A frame needs the one before.
     steps = zip(values, intervals or [1.0] * len(values), strict=True)
@@ -170,7 +171,7 @@ def adaptive_smoother(
         >>> round(adaptive_smoother(path)[21, 0, 0].item(), 1)
         5.4
     """
-    _check(values)
+    values = _checked(values)
     chosen = settings or AdaptiveSettings()
     points, dimensions = values.shape[1:]
     endless = replace(chosen, calm=0.0, memory=float("inf"), longest_gap=len(values))
@@ -192,8 +193,10 @@ def _long_gaps(values: Tensor, longest: int) -> Tensor:
     return unseen & (following - last - 1 > longest)
 
 
-def _check(values: Tensor) -> None:
+def _checked(values: Tensor) -> Tensor:
+    values = as_real(values)
     if values.ndim != 3 or not len(values):
         raise ShapeError(f"adaptive filter: found values {tuple(values.shape)}, expected (T,P,D) with a frame at least")
     if values.isinf().any():
         raise ValueRangeError("adaptive filter: found infinite measurements, expected numbers, or NaN for not seen")
+    return values

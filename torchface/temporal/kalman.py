@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.number_checks import as_real
 
 # Deviation of the first velocity and acceleration, in measurement deviations a frame: nothing is known of them.
 _FIRST_VELOCITY, _FIRST_ACCELERATION = 30.0, 30.0
@@ -192,6 +193,7 @@ def kalman_smoother(
         >>> kalman_smoother(path, KalmanSettings(measurement=0.1, jerk=0.01))[4:7, 0].round(decimals=2).tolist()
         [4.0, 5.0, 6.0]
     """
+    values = as_real(values)
     curves = _checked(values)
     frames = len(curves)
     if isinstance(settings, KalmanSettings):

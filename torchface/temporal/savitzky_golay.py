@@ -4,6 +4,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.number_checks import as_real
 
 
 def savitzky_golay(values: Tensor, window: int, order: int = 2) -> Tensor:
@@ -33,8 +34,9 @@ def savitzky_golay(values: Tensor, window: int, order: int = 2) -> Tensor:
         >>> torch.allclose(savitzky_golay(squares, window=5), squares, atol=1e-4)
         True
     """
-    frames = len(values)
-    if values.ndim == 0 or frames == 0:
+    values = as_real(values)
+    frames = len(values) if values.ndim else 0
+    if frames == 0:
         raise ShapeError(f"savitzky_golay: found values {tuple(values.shape)}, expected (T,...) with a frame at least")
     if window < 1 or not 0 <= order < window:
         raise ValueRangeError(f"savitzky_golay: found window {window} and order {order}, expected 0 <= order < window")
