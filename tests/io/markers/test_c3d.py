@@ -230,8 +230,19 @@ def test_counts_of_16_bits_that_began_again_or_stopped_are_not_believed(last: in
     points = np.ones((70_000, 1, 4), np.float32)
     count = struct.pack("<H", last) if kind == 2 else struct.pack("<f", 70_000)
     path = tmp_path / "take.c3d"
-    path.write_bytes(_build(points, parameters={(1, "FRAMES"): (kind, (), count)}, last_frame=last))
+    made = _build(points, parameters={(1, "FRAMES"): (kind, (), count)}, last_frame=last)
+    path.write_bytes(made + bytes(-len(made) % 512))
     assert len(load_c3d(path)) == 70_000
+    if kind == 4:  # no count of 16 bits
+        path.write_bytes(made + bytes(2**21))
+        assert len(load_c3d(path)) == 70_000
+
+
+@pytest.mark.parametrize("frames", [65_535, 65_536])
+def test_counts_at_the_end_of_16_bits_are_exact_in_files_of_whole_blocks(frames: int, tmp_path: Path) -> None:
+    made = _build(np.ones((frames, 1, 4), np.float32), last_frame=frames % 65_536)
+    (tmp_path / "take.c3d").write_bytes(made + bytes(-len(made) % 512))
+    assert len(load_c3d(tmp_path / "take.c3d")) == frames
 
 
 def test_a_frame_without_a_marker_loads_and_is_named_on_request(tmp_path: Path) -> None:
