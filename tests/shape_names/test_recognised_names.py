@@ -3,6 +3,7 @@
 import pytest
 import torch
 
+from torchface.capture.priors.shape_prior import face_halves
 from torchface.shape_names import (
     ARKIT,
     METAHUMAN,
@@ -10,7 +11,9 @@ from torchface.shape_names import (
     VISEMES,
     VRM0,
     VRM1,
+    antagonists,
     arkit_name,
+    mapping,
     recognised_mapping,
     recognised_shapes,
 )
@@ -159,6 +162,15 @@ def test_rigs_that_add_to_all_names_are_driven_by_arkit(form: str) -> None:
     matrix = recognised_mapping(plain, [form.format(name) for name in plain])
     assert torch.equal(matrix, torch.eye(len(plain)))
     assert torch.equal(recognised_mapping([form.format(name) for name in plain], plain), matrix)
+
+
+@pytest.mark.parametrize("form", ["hero_{}", "Char_{}_shape", "{}_Mesh"])
+def test_what_all_names_share_hides_no_meaning(form: str) -> None:
+    shared = [form.format(name) for name in ARKIT]
+    assert torch.equal(mapping(ARKIT, shared), torch.eye(len(ARKIT)))
+    assert torch.equal(antagonists(shared), antagonists(ARKIT))
+    assert face_halves(shared) == face_halves(ARKIT)
+    assert [shape.names for shape in recognised_shapes(shared).values()] == [(name,) for name in shared]
 
 
 def test_sides_in_front_and_shared_by_all_stay() -> None:

@@ -4,6 +4,7 @@ import re
 from collections.abc import Sequence
 from difflib import get_close_matches
 from functools import cache
+from os.path import commonprefix
 
 import torch
 from torch import Tensor
@@ -31,6 +32,8 @@ ARKit itself never has both above 0.03, in 5,538 frames of six takes; ``browDown
 """
 
 
+_SHARED_PREFIX = re.compile(r"(?:(?!(?:l|r|left|right|fcl)[^a-z0-9])[a-z0-9]*[^a-z0-9])+", re.IGNORECASE)
+_SHARED_SUFFIX = re.compile(r"(?:[^a-z0-9](?!(?:l|r|left|right)(?![a-z0-9]))[a-z0-9]+)+$", re.IGNORECASE)
 _PREFIX = re.compile(
     r"^(.*__(?=facs_)|.*(?=Fcl_)(?<!^)|.*[.:|](?=[^.:|]{3,}$)|(?:facs_)?(?:bs|jnt|ctrl|cbs)_|facs_|[at]\d\d_|arkit[_ ]|"
     r"au\d+_(?=[a-z]{3})|(?:head|face|blendshapes?|bs)\d*_(?=[a-z]))",
@@ -104,6 +107,31 @@ def arkit_name(name: str) -> str | None:
     return _table().get(words) or _table().get(tuple(sorted(words)))
 
 
+def read_as_arkit(names: Sequence[str]) -> list[str]:
+    """ARKit's name of each of a rig's shapes that has one, once each; the others without what all names begin or end
+    with, where ARKit's shapes have it too and are read without it: in ``eye_up`` and ``eye_down`` it is what they are
+    about.
+
+    Example:
+        >>> read_as_arkit(["hero_jawOpen", "hero_eyeBlink_L", "hero_earWiggle"])
+        ['jawOpen', 'eyeBlinkLeft', 'earWiggle']
+    """
+    plain = list(names)
+    start, end = commonprefix(plain), commonprefix([name[::-1] for name in names])[::-1]  # noqa: RUF071
+    before, after = _SHARED_PREFIX.match(start), _SHARED_SUFFIX.search(end)
+    if len(plain) > 1 and (before or after):
+        first, last = before.end() if before else 0, len(after[0]) if after else 0
+        short = [name[first : len(name) - last] or name for name in names]
+        known = {(arkit_name(name), arkit_name(one)) for name, one in zip(names, short, strict=True)} - {(None, None)}
+        if known and all(whole is None or one == whole for whole, one in known):
+            plain = short
+    read: list[str] = []
+    for name, short_name in zip(names, plain, strict=True):
+        arkit = arkit_name(name) or arkit_name(short_name)
+        read.append(short_name if arkit is None or arkit in read else arkit)
+    return read
+
+
 def side_written_out(name: str) -> str:
     """A name that ends in the side's first letter, as Blender wants it, with the side as ARKit writes it.
 
@@ -159,7 +187,7 @@ def _meanings(names: Sequence[str]) -> list[str]:
     """What each is called in one spelling: other programs' names as ARKit's, where no other of the names is it."""
     meanings = [_canonical(name) for name in names]
     known, taken = {name.lower() for name in ARKIT}, set(meanings)
-    for row, name in enumerate(names):
+    for row, name in enumerate(read_as_arkit(names)):
         arkit = "" if meanings[row] in known else (arkit_name(name) or "").lower()
         whole = re.sub(r"(left|right)$", "", arkit)
         if arkit and taken.isdisjoint({arkit, *_halves(arkit), *({whole} & known)}):

@@ -4,17 +4,14 @@ import re
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cache
-from os.path import commonprefix
 
 import torch
 from torch import Tensor
 
-from torchface.shape_names.arkit_names import ARKIT, arkit_name, mapping
+from torchface.shape_names.arkit_names import ARKIT, arkit_name, mapping, read_as_arkit
 from torchface.shape_names.name_tables import METAHUMAN, VRM1
 from torchface.shape_names.pose_names import posed_weights
 
-_SHARED_PREFIX = re.compile(r"(?:(?!(?:l|r|left|right|fcl)[^a-z0-9])[a-z0-9]*[^a-z0-9])+", re.IGNORECASE)
-_SHARED_SUFFIX = re.compile(r"(?:[^a-z0-9](?!(?:l|r|left|right)(?![a-z0-9]))[a-z0-9]+)+$", re.IGNORECASE)
 _VOWEL = re.compile(r"(?:fcl_mth_|vrc[._]v_)(a|i|u|e|o|aa|ih|ou|oh)", re.IGNORECASE)
 _CLIPS = {"a": "aa", "i": "ih", "u": "ou", "e": "ee", "o": "oh"}
 _MOODS = {
@@ -61,7 +58,8 @@ def recognised_shapes(names: Sequence[str]) -> dict[str, RecognisedShape]:
     """
     backwards = [*enumerate(names)][::-1]  # of two alike the first stays
     row = {name: number for number, name in backwards}
-    by_words = {arkit: number for number, name in backwards if (arkit := arkit_name(name)) is not None}
+    read = read_as_arkit(names)
+    by_words = {arkit: number for number, _ in backwards if (arkit := arkit_name(read[number])) is not None}
     found: dict[str, RecognisedShape] = {}
     for arkit in ARKIT:
         rows: tuple[int, ...] = ()
@@ -89,7 +87,10 @@ def recognised_mapping(from_names: Sequence[str], to_names: Sequence[str]) -> Te
         [[0.0, 1.0], [1.0, 0.0]]
     """
     matrix = mapping(from_names, to_names)
-    ours, theirs = _read_as_arkit(from_names), _read_as_arkit(to_names)
+    joined = {curve for curves in METAHUMAN.twins.values() for curve in curves}  # by the table, each with others
+    apart = [[one != other and not joined.isdisjoint((one, other)) for one in from_names] for other in to_names]
+    matrix[torch.tensor(apart, dtype=torch.bool).reshape(matrix.shape)] = 0.0
+    ours, theirs = read_as_arkit(from_names), read_as_arkit(to_names)
     copies = torch.zeros(len(to_names), len(from_names))
     for arkit, curves in METAHUMAN.twins.items():
         to_curves = [row for row, name in enumerate(to_names) if name in curves]
@@ -106,24 +107,6 @@ def recognised_mapping(from_names: Sequence[str], to_names: Sequence[str]) -> Te
         free = ~matrix.any(1, keepdim=True) & ~matrix.any(0, keepdim=True)
         matrix = torch.where(free, step, matrix)
     return matrix
-
-
-def _read_as_arkit(names: Sequence[str]) -> tuple[str, ...]:
-    """ARKit's name of each that has one, once each; the others without what all names begin or end with, where ARKit's
-    shapes have it too and are read without it: in ``eye_up`` and ``eye_down`` it is what the names are about."""
-    names = tuple(names)
-    start, end = commonprefix(names), commonprefix([name[::-1] for name in names])[::-1]  # noqa: RUF071
-    before, after = _SHARED_PREFIX.match(start), _SHARED_SUFFIX.search(end)
-    first, last = before.end() if before and len(names) > 1 else 0, len(after[0]) if after and len(names) > 1 else 0
-    plain = [name[first : len(name) - last] or name for name in names]
-    known = {(arkit_name(name), arkit_name(short)) for name, short in zip(names, plain, strict=True)} - {(None, None)}
-    if not known or any(full is not None and short != full for full, short in known):
-        plain = list(names)
-    read: list[str] = []
-    for name, short in zip(names, plain, strict=True):
-        arkit = arkit_name(name) or arkit_name(short)
-        read.append(short if arkit is None or arkit in read else arkit)
-    return tuple(read)
 
 
 def arkit_count(found: Collection[str], still: Sequence[str]) -> str:

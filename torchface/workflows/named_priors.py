@@ -13,7 +13,7 @@ from torchface import zoo
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior, ShapePrior, adapt_dynamics, unlearned
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.rig import BlendshapeRig
-from torchface.shape_names import arkit_name
+from torchface.shape_names import read_as_arkit
 
 DEFAULT_PRIOR = "shape_prior"
 """Of the zoo; what weights faces have, where no other prior is named."""
@@ -67,7 +67,7 @@ def knows_half(names: Sequence[str], rig: BlendshapeRig) -> bool:
 
 def _widened(prior: ShapePrior, deviation: float) -> ShapePrior:
     """A prior wider by a deviation of each weight, and so wide for lids that it neither shuts nor opens them."""
-    deviations = [_LID_DEVIATION if _LIDS.match(arkit_name(name) or name) else deviation for name in prior.names]
+    deviations = [_LID_DEVIATION if _LIDS.match(name) else deviation for name in read_as_arkit(prior.names)]
     return prior.widened(torch.tensor(deviations).square())
 
 

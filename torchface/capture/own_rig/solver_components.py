@@ -21,7 +21,7 @@ from torchface.errors import FileFormatError, NameMismatchError, ShapeError, Val
 from torchface.files.documents import Value
 from torchface.number_checks import as_tensor, checked_type
 from torchface.rig import BlendshapeRig
-from torchface.shape_names import arkit_name
+from torchface.shape_names import read_as_arkit
 
 CONTOUR_WEIGHT = 0.5
 ROTATION_STEP, TRANSLATION_STEP = 0.02, 4.0
@@ -117,7 +117,7 @@ class VideoSolverParts(nn.Module):
         count = len(names)
         # Nothing is expected of weights that no dynamics prior leads to, next to nothing of a first frame's.
         weight = 0.0 if dynamics is None else INITIAL_WEIGHT**-2
-        lids = [_LIDS.match(arkit_name(name) or name) for name in names]
+        lids = [_LIDS.match(name) for name in read_as_arkit(names)]
         constants = {
             "lower": [0.0] * count + [-torch.inf] * 6,
             "upper": [1.0] * count + [torch.inf] * 6,

@@ -18,7 +18,7 @@ from torchface.capture.priors.take_frames import TakeFrames
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_number
 from torchface.optim.full_precision import full_precision
-from torchface.shape_names import arkit_name
+from torchface.shape_names import read_as_arkit
 
 _UPPER = re.compile(r"(eye|brow|pupil)", re.IGNORECASE)
 LearnedDensity = ParzenDensity | StudentDensity
@@ -51,7 +51,7 @@ def face_halves(names: Sequence[str]) -> tuple[tuple[int, ...], ...]:
 
     Source: thesis 4.2.9.
     """
-    upper = tuple(i for i, name in enumerate(names) if _UPPER.match(arkit_name(name) or name))
+    upper = tuple(i for i, name in enumerate(read_as_arkit(names)) if _UPPER.match(name))
     lower = tuple(i for i in range(len(names)) if i not in upper)
     return tuple(group for group in (upper, lower) if group)
 

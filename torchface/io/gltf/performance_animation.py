@@ -14,6 +14,7 @@ from torchface.io.gltf.character_nodes import character_nodes, looks_back
 from torchface.io.gltf.gltf_document import Document, glb_pieces
 from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.gltf.scene import instances, local_transform, node_transforms
+from torchface.shape_names import read_as_arkit
 
 NECKS_SHARE = 0.3  # of the head's rotation, where there is a neck
 
@@ -139,7 +140,7 @@ def _looks_by_shapes(document: Document, node: int) -> bool:
         mesh = nodes[one].get("mesh")
         if mesh is None:
             continue
-        names = read_target_names(document, mesh)
+        names = read_as_arkit(read_target_names(document, mesh))
         for primitive in document.array(document.objects("meshes")[mesh], "primitives", "mesh"):
             for name, target in zip(names, primitive.get("targets", []), strict=False):
                 accessor = document.item("accessors", target.get("POSITION"), "targets")

@@ -14,7 +14,7 @@ from torchface.files.whole_files import make_folder
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import save_take
 from torchface.rig import BlendshapeRig
-from torchface.shape_names import arkit_name, mirror
+from torchface.shape_names import arkit_name, mirror, read_as_arkit
 from torchface.take import Take
 from torchface.viz.browser.browser_page import BrowserPage, SharedInput, frame_camera, icon
 from torchface.viz.browser.head_mesh import HeadOnPage
@@ -247,7 +247,7 @@ def grouped(names: Sequence[str]) -> dict[str, list[int]]:
     for row, twin in enumerate(twins):
         order.setdefault(row)
         order.setdefault(twin)
-    lowered = [(arkit_name(name) or name).lower() for name in names]
+    lowered = [name.lower() for name in read_as_arkit(names)]
     called = [
         next((group for prefix, group in _PREFIXES.items() if name.startswith(prefix)), "other") for name in lowered
     ]
