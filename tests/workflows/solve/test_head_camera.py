@@ -84,6 +84,17 @@ def test_a_video_that_does_not_go_with_the_markers_is_said_with_its_offset() -> 
     assert video_warnings(later, moved) == []
 
 
+def test_a_film_of_a_part_of_a_take_is_compared_with_that_part() -> None:
+    """A brow that moves all the time, of whose first quarter there is a film; and a take of one frame."""
+    up = (0.2 * torch.arange(400)).sin().clamp(min=0)[:, None]
+    alone = Take(60, weights=Track(("browInnerUp",), up[..., None]))
+    short = replace(curves(100, 60), names=("browInnerUp",), weights=up[:100], active=torch.ones(100, 1).bool())
+    assert video_warnings(alone, resampled_curves(short, take(400, 60))) == []
+    assert video_warnings(alone.frames(slice(1)), resampled_curves(short, take(1, 60))) == []
+    other = replace(short, weights=up[:100].roll(15, 0))
+    assert len(video_warnings(alone, resampled_curves(other, take(400, 60)))) == 1
+
+
 def test_gamma_is_the_largest_weight_of_a_prediction() -> None:
     usual, weak = resampled_curves(curves(90, 60), take(90, 60)), resampled_curves(curves(90, 60), take(90, 60), 1.0)
     torch.testing.assert_close(weak.gamma.values, usual.gamma.values / 4)

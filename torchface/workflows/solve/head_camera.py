@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from torchface import zoo
 from torchface.capture import ActionUnitClassifier
@@ -117,26 +118,37 @@ def video_warnings(alone: Take, predicted: Predicted) -> list[str]:
     """Whether the video's curves move as the weights of the markers alone; nothing where they do, or the markers show
     no motion of these shapes."""
     assert alone.weights is not None
-    own = alone.weights.select(predicted.weights.names).values[..., 0].double()
-    moves = torch.where(own.std(0) > _MOVES, own.std(0), 0.0)
-    if len(own) < 2 or not bool(moves.any()):
+    shown, own = (
+        of.select(predicted.weights.names).values[..., 0].double() for of in (predicted.weights, alone.weights)
+    )
+    leads = predicted.gamma.values[..., 0] > 0
+    ours, theirs, moves = _centred(torch.where(leads, shown, 0.0), own, torch.ones_like(leads))
+    if not bool(moves.any()):
         return []
-    led = torch.where(predicted.gamma.values > 0, predicted.weights.values, 0.0)[..., 0].double()
-    ours, theirs = (torch.nn.functional.normalize(values - values.mean(0), dim=0) for values in (led, own))
     size = 2 * len(own)
     spectrum = torch.fft.rfft(ours, size, dim=0).conj() * torch.fft.rfft(theirs, size, dim=0)
     correlation = torch.fft.irfft(spectrum, size, dim=0) @ moves / moves.sum()  # by how many frames the video is early
-    if float(correlation[0]) > _AGREES:
+    ours, theirs, moves = _centred(shown, own, leads)  # where it leads, for it may show a part of the take
+    found = max(float(correlation[0]), float((ours * theirs).sum(0) @ moves / moves.sum().clamp(min=_MOVES)))
+    if found > _AGREES:
         return []
     best = int(correlation.argmax())
     seconds = (best if best < len(own) else best - size) / alone.fps
     would = f" (by {float(correlation[best]):.2f} with `offset` in its labels {seconds:+.2f} s from now)"
     return [
-        f"the video's curves and those of the markers alone correlate by {float(correlation[0]):.2f}"
+        f"the video's curves and those of the markers alone correlate by {found:.2f}"
         + (would if float(correlation[best]) > _AGREES else "")
         + f", expected more than {_AGREES}: is it a video of this take, from its beginning on, at its true rate? "
         "Compare with a solve without it"
     ]
+
+
+def _centred(shown: Tensor, own: Tensor, among: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Curves (T,K) among some frames with mean 0 and norm 1, and how far ``own`` moves there, (K,), 0 where little."""
+    count = among.sum(0).clamp(min=1)
+    ours, theirs = (torch.where(among, one - (one * among).sum(0) / count, 0.0) for one in (shown, own))
+    moves = torch.nn.functional.threshold(theirs.norm(dim=0) / count.sqrt(), _MOVES, 0.0)
+    return torch.nn.functional.normalize(ours, dim=0), torch.nn.functional.normalize(theirs, dim=0), moves
 
 
 def _fitting_table(units: tuple[str, ...], names: tuple[str, ...]) -> str:
