@@ -61,6 +61,7 @@ def test_weights_of_examples_drive_a_character_by_name(performer_rig: Blendshape
     assert character_matrix(["jawOpen"], ["x", "jawOpen"]).tolist() == [[0.0], [1.0]]
     halves = character_matrix(["brow_raise_left"], ["browInnerUp_L", "browOuterUp_L"])
     assert halves.flatten().tolist() == pytest.approx([0.4, 1.0])
+    assert torch.equal(character_matrix(examples.names, examples.names), torch.eye(15))  # shapes of the same names
     with pytest.raises(NameMismatchError, match="expected ARKit's names"):
         character_matrix(examples.names, ["a", "b"])
 

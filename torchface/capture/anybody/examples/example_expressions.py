@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchface.errors import NameMismatchError
 from torchface.files.documents import read_toml
-from torchface.shape_names import ARKIT, mapping
+from torchface.shape_names import ARKIT, mapping, spelled_as
 
 NEUTRAL = "neutral"
 """The name of the face at rest, the first of the 16."""
@@ -69,7 +69,7 @@ def paper_expressions() -> tuple[ExampleExpression, ...]:
 def character_matrix(names: Sequence[str], shapes: Sequence[str]) -> Tensor:
     """The matrix (M,N) that turns weights of examples into weights of a character's shapes, by name.
 
-    The paper's expressions become the shapes of ARKit that they mean, other examples the shape of their own name;
+    Examples become the shape of their own name, else the paper's expressions the shapes of ARKit that they mean;
     those that turn the head move no shape. Order and count need not agree. Clamp what comes
     out to [0,1]: two expressions may share a shape.
 
@@ -88,7 +88,7 @@ def character_matrix(names: Sequence[str], shapes: Sequence[str]) -> Tensor:
     matrix = mapping(names, shapes)
     onto = mapping(ARKIT, shapes)
     for column, name in enumerate(names):
-        if name in known:
+        if name in known and spelled_as(name, shapes) is None:
             matrix[:, column] = onto @ torch.tensor([known[name].shapes.get(shape, 0.0) for shape in ARKIT])
     if not bool(matrix.any()):
         raise NameMismatchError(
