@@ -117,6 +117,14 @@ def test_bad_input() -> None:
         KalmanFilter(1, KalmanSettings(1, 1)).step(torch.full((1,), torch.inf))
 
 
+def test_what_was_returned_may_be_changed() -> None:
+    changed, kept = (KalmanFilter(1, KalmanSettings(measurement=0.5, jerk=0.01)) for _ in range(2))
+    for place in (1.0, 2.0, 1.5):
+        changed.step(torch.tensor([place])).sub_(100)
+        kept.step(torch.tensor([place]))
+    assert torch.equal(changed.step(torch.tensor([torch.nan])), kept.step(torch.tensor([torch.nan])))
+
+
 def test_two_short_steps_are_a_long_one() -> None:
     once, twice = (KalmanFilter(2, KalmanSettings(1.5, 0.4)) for _ in range(2))
     for running in (once, twice):

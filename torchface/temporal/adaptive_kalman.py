@@ -197,6 +197,4 @@ def _checked(values: Tensor) -> Tensor:
     values = as_real(values)
     if values.ndim != 3 or not len(values):
         raise ShapeError(f"adaptive filter: found values {tuple(values.shape)}, expected (T,P,D) with a frame at least")
-    if values.isinf().any():
-        raise ValueRangeError("adaptive filter: found infinite measurements, expected numbers, or NaN for not seen")
     return values

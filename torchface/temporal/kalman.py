@@ -167,7 +167,7 @@ class KalmanFilter:
             raise ValueRangeError("Kalman filter: found an infinite measurement, expected numbers, or NaN for not seen")
         self.to(measured.device).predict()
         self.correct(measured)
-        return self.state[:, 0]
+        return self.state[:, 0].clone()
 
 
 def kalman_smoother(
@@ -196,10 +196,9 @@ def kalman_smoother(
     values = as_real(values)
     curves = _checked(values)
     frames = len(curves)
-    if isinstance(settings, KalmanSettings):
-        running = KalmanFilter(curves.shape[1], replace(settings, longest_gap=frames))
-    else:
-        running = KalmanFilter(curves.shape[1], [replace(setting, longest_gap=frames) for setting in settings])
+    given = [settings] if isinstance(settings, KalmanSettings) else settings
+    each = [replace(one, longest_gap=frames) for one in given]
+    running = KalmanFilter(curves.shape[1], each if given is settings else each[0])
     running.to(curves.device)
     predicted, filtered = [], []
     for frame, interval in zip(curves, intervals or [1.0] * frames, strict=True):

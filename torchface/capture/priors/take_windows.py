@@ -10,8 +10,6 @@ from torchface.capture.priors.motion_features import windows_of
 
 FOLDS = 4  # of a single take
 _MOST_FOLDS = 100  # of several: what is kept of each fold is not to grow with the takes
-
-
 _RIDGE = 1e-6  # of the coefficients, in squared weights
 _POOLING = 0.02  # weight of the coefficients that all shapes share against each one's own
 

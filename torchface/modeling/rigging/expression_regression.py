@@ -17,8 +17,6 @@ from torchface.progress import Progress
 Form = Literal["offsets", "expressions"]
 
 STILL = 1e-4  # millimetres; what rounding of positions to float32 leaves of a vertex that does not move
-
-
 NEUTRAL_COMPONENTS, OFFSET_COMPONENTS = 14, 13
 
 
@@ -211,8 +209,7 @@ class ExpressionRegression(nn.Module):
         Raises:
             ShapeError: the neutrals are not (B,V,3).
         """
-        neutrals = as_real(neutrals, "neutrals")
-        return neutrals[:, None] + self.offsets(neutrals)
+        return self.offsets(neutrals) + as_real(neutrals, "neutrals")[:, None]
 
     @full_precision
     def offsets(self, neutrals: Tensor) -> Tensor:

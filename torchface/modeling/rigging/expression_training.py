@@ -205,13 +205,9 @@ def choose_components(
     for left_out in range(len(inputs)):  # a fold each: a spectrum each
         errors += _fold_errors(gram_in, gram_out, left_out, ridges, most)
     allowed = torch.zeros_like(errors, dtype=torch.bool)
-    rows = slice(None) if input_components is None else slice(min(input_components, most) - 1, None)
-    columns = slice(1, None) if output_components is None else slice(min(output_components, most), None)
+    rows = slice(None) if input_components is None else min(input_components, most) - 1
+    columns = slice(1, None) if output_components is None else min(output_components, most)
     allowed[:, rows, columns] = True
-    if input_components is not None:
-        allowed[:, min(input_components, most) :] = False
-    if output_components is not None:
-        allowed[:, :, min(output_components, most) + 1 :] = False
     # Of equal errors the first: the smallest ridge and the smallest number of components.
     best = int(torch.where(allowed, errors, torch.inf).argmin())
     r, k, j = (int(index) for index in torch.unravel_index(torch.tensor(best), errors.shape))

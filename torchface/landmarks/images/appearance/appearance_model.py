@@ -81,10 +81,8 @@ class AppearanceSettings:
     @classmethod
     def of(cls, settings: "AppearanceSettings | dict[str, Any] | None") -> "AppearanceSettings":
         """Settings from what a file holds."""
-        if settings is None:
-            return cls()
-        if isinstance(settings, AppearanceSettings):
-            return settings
+        if settings is None or isinstance(settings, AppearanceSettings):
+            return settings or cls()
         return cls(**{**settings, "resolutions": tuple(settings["resolutions"])})
 
 

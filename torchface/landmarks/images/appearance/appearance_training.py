@@ -33,10 +33,9 @@ def learn_appearance(
     triangles = face_triangles(shapes.mean)
     points = with_forehead(shapes.mean[None], settings.jaw_margin)[0]
     grids = [face_grid(points * (one / settings.spacing), triangles) for one in settings.resolutions]
-    modes = len(grey) - 1
-    parts = 2 if settings.parts else 1
+    modes = (2 if settings.parts else 1) * (len(grey) - 1)
     model = AppearanceModel(
-        len(shapes.modes), [len(grid.pixels) for grid in grids], [parts * modes] * len(grids), len(triangles), settings
+        len(shapes.modes), [len(grid.pixels) for grid in grids], [modes] * len(grids), len(triangles), settings
     )
     model.mean_shape.copy_(shapes.mean)
     model.motions.copy_(torch.cat([similarity_modes(shapes.mean), shapes.modes]))
