@@ -76,7 +76,7 @@ def unveiled(image: Tensor, parts: FaceParts) -> Tensor:
     """A photograph (3,H,W), sRGB, without the grey that a webcam or a bad lens adds to all colours.
 
     As much is taken away as makes skin as red as that of people, but no more than is in the darkest of the head; skin
-    stays as bright as it was. Grey photographs stay as they are.
+    stays as bright as it was. Grey photographs and those in blue light, whose skin would get bluer, stay as they are.
     """
     crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), parts.transform, parts.shares.shape[-1]).float() / 255
     is_skin, head = parts.of("skin") > _SURE, parts.of(*_HEAD) > _SURE
@@ -85,7 +85,7 @@ def unveiled(image: Tensor, parts: FaceParts) -> Tensor:
     skin = crop[:, is_skin].median(1).values
     dark = torch.nn.functional.avg_pool2d(crop[None], 3, 1, 1, count_include_pad=False)[0].mean(0)[head]
     veil = min(float(_REDNESS * skin[2] - skin[0]) / (_REDNESS - 1), float(dark.quantile(_DARKEST_SHARE)))
-    if veil <= 0 or float(skin.amax() - skin.amin()) < _COLORLESS:
+    if veil <= 0 or float(skin[0] - skin[2]) < _COLORLESS:
         return image
     return ((image - veil) * float(skin.mean() / (skin.mean() - veil))).clamp(0, 1)
 
