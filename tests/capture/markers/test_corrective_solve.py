@@ -141,6 +141,12 @@ def test_predictions_pull_solves_with_correctives_too(
     assert (pulled[:, 3] - 0.25).abs().max() < 1e-3
     energy = solver.energy(markers, predicted, gamma)
     assert (energy.value(pulled) < energy.value(alone)).all()
+    # Frames that nothing joins are those of a whole take, also where a prediction pulls in some of them alone.
+    predicted[:, 5], gamma[2:, 5], gamma[:, 3] = 0.9, 8.0, 2.0
+    joined = WholeTakeSolver(solver.markers, smoothness=0.0, sparsity=float(solver.markers.sparsity))
+    for seen in (markers, markers.clone().index_fill(1, torch.tensor([7]), torch.nan)):
+        together = joined(seen, predicted=predicted, gamma=gamma)
+        torch.testing.assert_close(together, solver(seen, predicted, gamma), rtol=0, atol=5e-3)
 
 
 def test_a_whole_take_is_smoothed_with_correctives(rig: BlendshapeRig, attachment: Attachment) -> None:

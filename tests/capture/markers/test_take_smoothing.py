@@ -32,8 +32,9 @@ def test_errors_on_the_performer_are_smaller(performance: Performance) -> None:
         assert error <= 0.8 * (solver(markers.values[::every]) - true[::every]).abs().mean()
 
 
+@pytest.mark.parametrize("gamma", [0.0, 1.0, 30.0])
 def test_without_release_it_is_the_exact_quadratic_program(
-    small_rig: BlendshapeRig, small_attachment: Attachment
+    gamma: float, small_rig: BlendshapeRig, small_attachment: Attachment
 ) -> None:
     generator = torch.Generator().manual_seed(0)
     frames, shapes = 14, 12
@@ -47,10 +48,16 @@ def test_without_release_it_is_the_exact_quadratic_program(
     eye = torch.eye(shapes, dtype=torch.float64)
     H = torch.kron(torch.eye(frames, dtype=torch.float64), energy.H) + 10 * torch.kron(bend.T @ bend, eye)
     f = energy.f - solver.sparsity + 0.05
+    # A classifier pulls some weights of some frames, which the markers' count divides.
+    predicted, pull = torch.rand(2, frames, shapes, generator=generator, dtype=torch.float64)
+    pull = gamma * torch.where(pull > 0.6, pull, 0.0)
+    H = H + (2 * pull / len(solver.labels)).flatten().diag()
+    f = f - 2 * pull / len(solver.labels) * predicted
     exact = box_qp(H, f.reshape(1, -1)).reshape(frames, shapes)
-    found = whole(markers)
+    found = whole(markers, predicted=predicted, gamma=pull) if gamma else whole(markers)
     torch.testing.assert_close(found, exact, rtol=0, atol=3e-3)
-    assert whole.energy(markers, found) <= whole.energy(markers, exact) + 1e-2
+    if not gamma:
+        assert whole.energy(markers, found) <= whole.energy(markers, exact) + 1e-2
 
 
 def test_nothing_nearby_has_less_energy_whatever_is_hidden(

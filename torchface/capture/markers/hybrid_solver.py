@@ -111,7 +111,7 @@ class HybridSolver(nn.Module):
             ShapeError: the shapes do not fit each other.
             ValueRangeError: a prediction that counts is NaN or outside [0,1], or a gamma is negative or not finite.
         """
-        self._check(markers, predicted, gamma)
+        check_predictions(predicted, gamma, (len(markers), len(self.names)))
         alone: Tensor = self.markers(markers)
         pulled = (gamma > 0).any(1).nonzero()[:, 0]
         if not len(pulled):
@@ -148,31 +148,39 @@ class HybridSolver(nn.Module):
             )
         markers = self.markers.arrange(take.markers)
         rows = frames_seen(markers)
-        seen = self(markers[rows], self._in_rig_order(predicted)[rows], self._in_rig_order(gamma)[rows])
+        curves = [in_rig_order(self.markers, track)[rows] for track in (predicted, gamma)]
+        seen = self(markers[rows], *curves)
         weights = interpolated(seen, rows, len(markers))
         return replace(take, weights=Track(self.names, weights[..., None]))
 
-    def _in_rig_order(self, curves: Track) -> Tensor:
-        known = [name for name in self.names if name in curves.names]
-        unknown = [name for name in curves.names if name not in self.names]
-        if unknown:
-            raise NameMismatchError(
-                f"predicted curves: found {', '.join(unknown[:5])}, expected shapes of the rig: "
-                f"{', '.join(self.names[:5])}, ..."
-            )
-        values = curves.select(known).values[..., 0].to(self.markers.rest.device)
-        rows = torch.tensor([self.names.index(name) for name in known], dtype=torch.int64, device=values.device)
-        return values.new_zeros(len(curves), len(self.names)).index_copy(1, rows, values)
 
-    def _check(self, markers: Tensor, predicted: Tensor, gamma: Tensor) -> None:
-        wanted = (len(markers), len(self.names))
-        for name, found in (("predicted", predicted), ("gamma", gamma)):
-            if tuple(found.shape) != wanted:
-                raise ShapeError(f"{name}: found {tuple(found.shape)}, expected {wanted}")
-        if not bool(((gamma >= 0) & (gamma <= LARGEST_WEIGHT)).all()):
-            raise ValueRangeError(
-                f"gamma: found negative, NaN or infinite numbers, expected finite ones of 0 to {LARGEST_WEIGHT:.0e}"
-            )
-        counts = predicted[gamma > 0]
-        if not bool(((counts >= 0) & (counts <= 1)).all()):
-            raise ValueRangeError("predicted: found weights outside [0,1] where gamma is positive")
+def in_rig_order(solver: MarkerSolver, curves: Track) -> Tensor:
+    """Curves (T,K,1) of some of a rig's shapes as (T,N) of all, 0 for the others.
+
+    Raises:
+        NameMismatchError: a name is not the rig's.
+    """
+    known = [name for name in solver.names if name in curves.names]
+    unknown = [name for name in curves.names if name not in solver.names]
+    if unknown:
+        raise NameMismatchError(
+            f"predicted curves: found {', '.join(unknown[:5])}, expected shapes of the rig: "
+            f"{', '.join(solver.names[:5])}, ..."
+        )
+    values = curves.select(known).values[..., 0].to(solver.rest.device)
+    rows = torch.tensor([solver.names.index(name) for name in known], dtype=torch.int64, device=values.device)
+    return values.new_zeros(len(curves), len(solver.names)).index_copy(1, rows, values)
+
+
+def check_predictions(predicted: Tensor, gamma: Tensor, wanted: tuple[int, int]) -> None:
+    """Refuses predictions and weights of them that are not (T,N), or that no energy has a minimum with."""
+    for name, found in (("predicted", predicted), ("gamma", gamma)):
+        if tuple(found.shape) != wanted:
+            raise ShapeError(f"{name}: found {tuple(found.shape)}, expected {wanted}")
+    if not bool(((gamma >= 0) & (gamma <= LARGEST_WEIGHT)).all()):
+        raise ValueRangeError(
+            f"gamma: found negative, NaN or infinite numbers, expected finite ones of 0 to {LARGEST_WEIGHT:.0e}"
+        )
+    counts = predicted[gamma > 0]
+    if not bool(((counts >= 0) & (counts <= 1)).all()):
+        raise ValueRangeError("predicted: found weights outside [0,1] where gamma is positive")

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from torchface.capture.corrective_energy import CorrectiveEnergy
 from torchface.capture.markers.given_markers import frames_seen, markers_of
+from torchface.capture.markers.hybrid_solver import check_predictions, in_rig_order
 from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
 from torchface.errors import ShapeError, TraceError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, check_rate, checked_number, checked_type
@@ -47,7 +48,8 @@ class WholeTakeSolver(nn.Module):
 
     with Huber's :math:`h_\tau(d) = d^2` for :math:`|d| \le \tau` and :math:`2\tau|d| - \tau^2` beyond it: slow motion
     is smoothed, a blink or a syllable passes. The first term counts all M markers, seen or not, so a frame that
-    shows few of them depends more on its neighbours, and one that shows none is interpolated.
+    shows few of them depends more on its neighbours, and one that shows none is interpolated. What a classifier
+    predicts pulls as in :class:`HybridSolver`.
 
     Args:
         markers: rig, attachment, alignment and ridge; its sparsity is for single frames, see ``sparsity``.
@@ -92,18 +94,31 @@ class WholeTakeSolver(nn.Module):
         """Of the L1 penalty, mm² a marker; follows the marker solver's where none was given."""
         return SPARSITY_RATIO * penalty_value(self.markers.sparsity) if self._sparsity is None else self._sparsity
 
-    def solve_take(self, take: Take) -> Take:
-        """The take with weights solved from its markers, matched by label.
+    def solve_take(self, take: Take, predicted: Track | None = None, gamma: Track | None = None) -> Take:
+        """The take with weights solved from its markers, matched by label, and from predictions, by name.
+
+        Args:
+            take: markers.
+            predicted, gamma: (T,K,1) for any of the rig's shapes, both for the same ones; see :class:`HybridSolver`.
 
         Raises:
-            NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows.
+            NameMismatchError: the take has no markers, labels that the attachment does not know, or none that it knows;
+                or a prediction is none of the rig's.
             ValueRangeError: no frame shows any marker, or a coordinate is infinite.
         """
-        weights = self(self.markers.arrange(markers_of(take)), take.fps, take.seconds)
+        curves = [None if track is None else in_rig_order(self.markers, track) for track in (predicted, gamma)]
+        weights = self(self.markers.arrange(markers_of(take)), take.fps, take.seconds, *curves)
         return replace(take, weights=Track(self.markers.names, weights[..., None]))
 
     @data_dependent("torchface.onnx.SolverGraph for frame by frame, which `torchface export solver` writes")
-    def forward(self, markers: Tensor, fps: float = _REFERENCE_FPS, seconds: Tensor | None = None) -> Tensor:
+    def forward(
+        self,
+        markers: Tensor,
+        fps: float = _REFERENCE_FPS,
+        seconds: Tensor | None = None,
+        predicted: Tensor | None = None,
+        gamma: Tensor | None = None,
+    ) -> Tensor:
         """Weights (T,N) for the markers (T,M,3) of consecutive frames, NaN for not seen; without derivatives.
 
         Frames that come unevenly are solved on an even grid whose other frames show nothing, so that curves bend in
@@ -113,9 +128,10 @@ class WholeTakeSolver(nn.Module):
             markers: of the frames.
             fps: frames a second.
             seconds: when each is shown, (T,), rising, where they come unevenly.
+            predicted, gamma: as :meth:`HybridSolver.forward` takes them, (T,N); both or none.
 
         Raises:
-            ShapeError: ``markers`` is not (T,M,3).
+            ShapeError: ``markers`` is not (T,M,3), or predictions are not (T,N).
             ValueRangeError: no frame shows any marker, or a coordinate is infinite; or nearly all would be gaps.
             TraceError: ``markers`` ask for gradients.
         """
@@ -131,18 +147,29 @@ class WholeTakeSolver(nn.Module):
             raise ValueRangeError(f"markers: found none in any of {len(markers)} frames, expected some")
         solve = self._solve if self.markers.activation is None else self._solve_corrected
         with torch.no_grad():
+            pull = self._pull(len(markers), predicted, gamma)
             if seconds is None or len(markers) < 2:
-                return solve(markers.double(), *self._scaled(fps)).to(markers.dtype)
+                return solve(markers.double(), *self._scaled(fps), pull).to(markers.dtype)
             rate, rows = frame_grid(seconds, fps)
             rows = rows.to(markers.device)
             grid = markers.new_full((int(rows[-1]) + 1, *markers.shape[1:]), torch.nan, dtype=torch.float64)
             grid[rows] = markers.double()
             smoothness, huber_threshold = self._scaled(rate)
             # A finer grid has more second differences a second, and no more frames that show something.
-            return solve(grid, smoothness * fps / rate, huber_threshold)[rows].to(markers.dtype)
+            on_grid = None if pull is None else pull.at(rows, len(grid))
+            return solve(grid, smoothness * fps / rate, huber_threshold, on_grid)[rows].to(markers.dtype)
+
+    def _pull(self, frames: int, predicted: Tensor | None, gamma: Tensor | None) -> "_Pull | None":
+        if predicted is None or gamma is None:
+            if predicted is not gamma:
+                raise ShapeError("predicted and gamma: found one of them, expected both or none")
+            return None
+        check_predictions(predicted, gamma, (frames, len(self.markers.names)))
+        counts = gamma > 0
+        return _Pull(torch.where(counts, predicted, 0.0).double(), gamma.double() / len(self.markers.rest))
 
     def energy(self, markers: Tensor, weights: Tensor, fps: float = _REFERENCE_FPS) -> float:
-        """What the solve minimises, over all frames."""
+        """What the solve minimises, over all frames, without predictions."""
         smoothness, huber_threshold = self._scaled(fps)
         solver = self.markers
         seen = solver.in_rig_space(markers.double())
@@ -158,13 +185,13 @@ class WholeTakeSolver(nn.Module):
         check_rate(fps, "fps", ValueRangeError)
         return self.smoothness * (fps / _REFERENCE_FPS) ** 4, self.huber_threshold * (_REFERENCE_FPS / fps) ** 2
 
-    def _solve(self, markers: Tensor, smoothness: float, huber_threshold: float) -> Tensor:
+    def _solve(self, markers: Tensor, smoothness: float, huber_threshold: float, pull: "_Pull | None") -> Tensor:
         r"""Splitting: a smooth problem without bounds, then a clamp.
 
         The smooth problem has one H and one Laplacian K in all frames. A cosine transform over time diagonalises K, the
         eigenvectors of H the rest, so a step is two transforms, products and a division. What differs from frame to
         frame is on its right side, updated by majorisation, which keeps the minimum: a marker that is not seen is
-        filled in by the weights, and the part b of a second difference beyond :math:`\tau` is subtracted,
+        filled in by the weights, as is what a prediction pulls less than in another frame, and the part b of a second difference beyond :math:`\tau` is subtracted,
         :math:`h_\tau(d) = \min_b (d - b)^2 + 2\tau|b|`.
 
         Source: Boyd et al. 2011, section 5.2; Geman and Yang 1995 for b.
@@ -175,6 +202,8 @@ class WholeTakeSolver(nn.Module):
         count, shapes = len(rest), rows.shape[1]
         H = (2.0 / count) * (rows.T @ rows)
         H.diagonal().add_(2 * penalty_value(solver.ridge))
+        if pull is not None:
+            H.diagonal().add_(2 * pull.most)
         smooth = _SmoothProblem.of(H, len(seen), smoothness, huber_threshold)
         gaps = torch.isnan(seen).any(-1)
         seen_mask = ~gaps[..., None]
@@ -188,17 +217,19 @@ class WholeTakeSolver(nn.Module):
             f = offset + penalty
             if len(frames):
                 f[frames] -= (torch.where(hidden, z[frames] @ rows.T, 0.0) @ rows) * (2.0 / count)
-            return f
+            return f if pull is None else f - 2 * (pull.weight * pull.goal + (pull.most - pull.weight) * z)
 
         return smooth.least(slope, z, torch.zeros_like(z))[0]
 
-    def _solve_corrected(self, markers: Tensor, smoothness: float, huber_threshold: float) -> Tensor:
+    def _solve_corrected(
+        self, markers: Tensor, smoothness: float, huber_threshold: float, pull: "_Pull | None"
+    ) -> Tensor:
         """With correctives: steps to the least of the problem above, with the mean frame's H in place of each frame's.
 
         A step is taken as far as the energy falls. The start is each frame's own solution.
         """
         solver = with_sparsity(self.markers, self.sparsity)
-        data = _TakeData.of(solver, markers)
+        data = _TakeData.of(solver, markers, pull)
         rows = frames_seen(markers)
         w = interpolated(solver(markers[rows].float()), rows, len(markers)).double()  # a start needs no more digits
         H = data.hessian(w)
@@ -302,6 +333,24 @@ class _SmoothProblem:
 
 
 @dataclass(frozen=True, eq=False)
+class _Pull:
+    """What predictions ask of each frame: weights (T,N) near goals (T,N), over all markers."""
+
+    goal: Tensor
+    weight: Tensor
+
+    @property
+    def most(self) -> Tensor:
+        """In any frame, (N,)."""
+        return self.weight.amax(0)
+
+    def at(self, rows: Tensor, frames: int) -> "_Pull":
+        """The same where these frames are ``rows`` (T,) of more."""
+        empty = self.goal.new_zeros(frames, self.goal.shape[1])
+        return _Pull(empty.index_copy(0, rows, self.goal), empty.index_copy(0, rows, self.weight))
+
+
+@dataclass(frozen=True, eq=False)
 class _TakeData:
     """What markers ask of each frame of a rig with correctives, over all M markers, seen or not."""
 
@@ -309,21 +358,27 @@ class _TakeData:
     # Of frames that show all; None where a frame has gaps, whose residuals are then formed anew.
     energy: CorrectiveEnergy | None
     seen: Tensor  # in rig space, (T,M,3)
+    pull: "_Pull | None"
 
     @staticmethod
-    def of(solver: MarkerSolver, markers: Tensor) -> "_TakeData":
+    def of(solver: MarkerSolver, markers: Tensor, pull: "_Pull | None") -> "_TakeData":
         whole = None if bool(torch.isnan(markers).any()) else solver.complete_energy(markers)
         energy = whole if isinstance(whole, CorrectiveEnergy) else None
-        return _TakeData(solver, energy, solver.in_rig_space(markers))
+        return _TakeData(solver, energy, solver.in_rig_space(markers), pull)
 
     def value(self, weights: Tensor) -> float:
+        pulled = 0.0 if self.pull is None else float((self.pull.weight * (weights - self.pull.goal).square()).sum())
         if self.energy is not None:
-            return float(self.energy.value(weights).sum())
+            return float(self.energy.value(weights).sum()) + pulled
         own = self.solver.regularization(weights).value(weights).sum()
-        return float(self._residual(weights).square().sum() / self.seen.shape[1] + own)
+        return float(self._residual(weights).square().sum() / self.seen.shape[1] + own) + pulled
 
     def gradient(self, weights: Tensor) -> Tensor:
         """(T,N) at weights (T,N)."""
+        own = self._of_markers(weights)
+        return own if self.pull is None else own + 2 * self.pull.weight * (weights - self.pull.goal)
+
+    def _of_markers(self, weights: Tensor) -> Tensor:
         if self.energy is not None:
             return self.energy.gradient(weights)
         activation = self.solver.activation
@@ -340,7 +395,8 @@ class _TakeData:
         some = weights[:: max(1, len(weights) // _HESSIAN_FRAMES)]
         whole = self.solver.complete_energy(torch.zeros(len(some), *self.seen.shape[1:]).to(weights))
         assert isinstance(whole, CorrectiveEnergy)
-        return whole.linearised(some).H.mean(0)
+        H = whole.linearised(some).H.mean(0)
+        return H if self.pull is None else H + (2 * self.pull.most).diag()
 
     def _residual(self, weights: Tensor) -> Tensor:
         return (self.solver.points(weights) - self.seen).nan_to_num(0.0)

@@ -55,8 +55,7 @@ class SolveSettings:
     subtract_rest: bool = True  # subtract what is left at rest between markers and sites of an aligned take
     slip: bool = False  # the helmet moves on the head
     clean: bool = False  # find and repair swapped labels, spikes and markers that drift or fell off
-    # Every frame on its own; otherwise the weights of the whole take at once, smooth over time. With what a head camera
-    # saw every frame is on its own.
+    # Every frame on its own; otherwise the weights of the whole take at once, smooth over time.
     frame_by_frame: bool = False
     # sparsity, ridge: see MarkerSolver
     sparsity: float = SPARSITY
@@ -192,7 +191,7 @@ def solve_markers(
     """A take's weights: aligned with the rig, cleaned, freed of slip and of what is left at rest, solved, with what
     a head camera predicted if given."""
     progress = progress or silent
-    whole = predicted is None and not settings.frame_by_frame
+    whole = not settings.frame_by_frame
     warnings = check_coverage(attachment, take, len(rig.names), settings.insist).warnings()
 
     alignment, head, raw = None, None, take
@@ -237,12 +236,13 @@ def solve_markers(
         # Sites that are nearer to the markers show the helmet's motion better.
         steady, motion = _without_slip(rig, attachment, take, settings)
         solver = MarkerSolver(rig, attachment, sparsity=settings.sparsity, ridge=settings.ridge)
-    if predicted is not None:
-        if not doubts:  # weights that are wrong themselves say nothing of a video
-            warnings += video_warnings(solver.solve_take(steady), predicted)
-        solved = HybridSolver(solver).solve_take(steady, predicted.weights, predicted.gamma)
+    curves = () if predicted is None else (predicted.weights, predicted.gamma)
+    if predicted is not None and not doubts:  # weights that are wrong themselves say nothing of a video
+        warnings += video_warnings(solver.solve_take(steady), predicted)
+    if whole:
+        solved = WholeTakeSolver(solver).solve_take(steady, *curves)
     else:
-        solved = WholeTakeSolver(solver).solve_take(steady) if whole else solver.solve_take(steady)
+        solved = HybridSolver(solver).solve_take(steady, *curves) if curves else solver.solve_take(steady)
 
     assert steady.markers is not None
     labels = tuple(label for label in attachment.labels or () if label in steady.markers.names)
