@@ -191,8 +191,8 @@ class WholeTakeSolver(nn.Module):
         The smooth problem has one H and one Laplacian K in all frames. A cosine transform over time diagonalises K, the
         eigenvectors of H the rest, so a step is two transforms, products and a division. What differs from frame to
         frame is on its right side, updated by majorisation, which keeps the minimum: a marker that is not seen is
-        filled in by the weights, as is what a prediction pulls less than in another frame, and the part b of a second difference beyond :math:`\tau` is subtracted,
-        :math:`h_\tau(d) = \min_b (d - b)^2 + 2\tau|b|`.
+        filled in by the weights, as is what a prediction pulls less than in another frame, and the part b of a second
+        difference beyond :math:`\tau` is subtracted, :math:`h_\tau(d) = \min_b (d - b)^2 + 2\tau|b|`.
 
         Source: Boyd et al. 2011, section 5.2; Geman and Yang 1995 for b.
         """
