@@ -1,5 +1,6 @@
 """The detector on small images with planted landmarks: it learns, decides by location, keeps its state on disk."""
 
+import copy
 import hashlib
 from pathlib import Path
 
@@ -49,6 +50,13 @@ def drawn(seed: int, decoy: tuple[str, float, float] | None = None) -> tuple[Ten
 def detector() -> UVLandmarkDetector:
     images, places = zip(*(drawn(seed) for seed in range(8)), strict=True)
     return UVLandmarkDetector.fit(torch.stack(images), torch.stack(places), NAMES, settings=SETTINGS)
+
+
+def test_images_and_landmarks_may_be_part_of_a_graph(detector: UVLandmarkDetector) -> None:
+    images, places = zip(*(drawn(seed) for seed in range(8)), strict=True)
+    given = [torch.stack(one).requires_grad_() for one in (images, places)]
+    again = copy.deepcopy(UVLandmarkDetector.fit(*given, NAMES, settings=SETTINGS))
+    assert all(torch.equal(value, again.state_dict()[name]) for name, value in detector.state_dict().items())
 
 
 def test_planted_landmarks_are_found_in_new_images(detector: UVLandmarkDetector) -> None:

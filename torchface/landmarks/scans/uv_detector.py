@@ -178,6 +178,7 @@ class UVLandmarkDetector(nn.Module):
             ValueRangeError: fewer than two images, or a landmark that fewer than two have.
         """
         _check_training(images, landmarks, names)
+        images, landmarks = images.detach(), landmarks.detach()
         self = cls(len(images), images.shape[-1], names, appearance, settings, None if frame is None else frame.config)
         if frame is not None and self.frame is not None:
             self.frame.load_state_dict(frame.state_dict())
@@ -233,8 +234,7 @@ class UVLandmarkDetector(nn.Module):
         if without is not None:
             good[without] = False
         places, votes = place[good].unique(return_counts=True)
-        columns, rows = places % width, torch.div(places, width, rounding_mode="floor")
-        return self.settings.hog.positions(torch.stack([columns, rows], dim=-1)), votes
+        return self.settings.hog.positions(torch.stack([places % width, places // width], dim=-1)), votes
 
     def _locate(self, landmark: int, columns: Tensor, width: int) -> tuple[Tensor, Tensor]:
         best, share = self._best_cluster(landmark, *self.matches(landmark, columns, width))

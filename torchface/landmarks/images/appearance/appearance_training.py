@@ -25,7 +25,7 @@ def learn_appearance(
     """See :meth:`AppearanceModel.fit`."""
     grey = [_checked(image, number) for number, image in enumerate(images)]
     _check_landmarks(grey, landmarks)
-    landmarks = landmarks.float()
+    landmarks = landmarks.detach().float()
     if settings.mirror:
         landmarks = torch.cat([landmarks, mirrored(landmarks, [image.shape[-1] for image in grey])])
         grey = [*grey, *(image.flip(-1) for image in grey)]
@@ -136,7 +136,7 @@ def left_out_residual(gram: Tensor) -> Tensor:
 def _checked(image: Tensor, number: int) -> Tensor:
     if image.ndim not in (2, 3) or (image.ndim == 3 and image.shape[0] not in (1, 3)) or min(image.shape[-2:]) < 16:
         raise ShapeError(f"image {number}: found {tuple(image.shape)}, expected (H,W) or (3,H,W), 16 pixels or more")
-    values = image.float() / 255 if image.dtype == torch.uint8 else image.float()
+    values = image.float() / 255 if image.dtype == torch.uint8 else image.detach().float()
     if not bool(torch.isfinite(values).all()):
         raise ValueRangeError(f"image {number}: found NaN or infinity, expected values in [0,1]")
     return grey_images(values.reshape(1, -1, *image.shape[-2:]))[0]

@@ -114,7 +114,7 @@ def fit_trees(
 ) -> LandmarkTrees:
     """See :meth:`LandmarkTrees.fit`."""
     settings = settings or TreeSettings()
-    boxes, landmarks = boxes.float(), landmarks.float()
+    boxes, landmarks = boxes.detach().float(), landmarks.detach().float()
     _check(images, boxes, landmarks)
     count = landmarks.shape[1]
     if mirror is None and count == len(MIRROR_68):
