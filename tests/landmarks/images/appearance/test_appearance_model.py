@@ -348,8 +348,9 @@ def test_bad_input_is_refused_by_name(film: PortraitVideo, model: AppearanceMode
         AppearanceModel.fit(frames, points + 500)
     with pytest.raises(ValueRangeError, match="landmarks 0: found all on one line"):
         AppearanceModel.fit(frames, points * torch.tensor([1.0, 0.0]) + 50)
-    with pytest.raises(ValueRangeError, match="images: found faces that all look the same"):
-        AppearanceModel.fit(frames[:1] * 4, points[:1].expand(4, -1, -1))
+    for count in (4, 7):  # a mean of seven equal numbers is rounded
+        with pytest.raises(ValueRangeError, match="images: found faces that all look the same"):
+            AppearanceModel.fit(frames[:1] * count, points[:1].expand(count, -1, -1))
     with pytest.raises(ShapeError, match="image 1"):
         AppearanceModel.fit([frames[0], frames[1][None, None], *frames[2:]], points)
     with pytest.raises(ShapeError, match=r"initial: found \(2, 67, 2\)"):

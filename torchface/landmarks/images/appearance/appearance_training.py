@@ -96,10 +96,10 @@ def _learn_textures(model: AppearanceModel, level: AppearanceLevel, textures: Te
     above = model.mean_shape[:, 1] < model.mean_shape[_NOSE_BRIDGE, 1]
     upper = torch.cat([above, above.new_ones(10)])[level.corner].float().mean(1) > 0.5
     masks = [upper, ~upper] if model.settings.parts else [torch.ones_like(upper)]
-    mean = textures.mean(0)
+    mean = textures.mean(0, dtype=torch.float64)  # exact where all are the same
     level.mean.copy_(mean[0])
     level.slope[0].copy_(mean[1:].permute(1, 2, 0))
-    centred = (textures - mean).double()
+    centred = textures - mean
     left = torch.zeros((), dtype=torch.float64)
     for part, mask in enumerate(masks):
         rows = slice(part * (len(textures) - 1), (part + 1) * (len(textures) - 1))
