@@ -178,7 +178,7 @@ def _mean(
 
 
 def _centred(samples: Samples, begin: int, end: int, mean: Tensor) -> Tensor:
-    return samples.read(begin, end).flatten(1) - mean
+    return samples.read(begin, end).flatten(1).to(torch.float64, copy=True).sub_(mean)
 
 
 class _Rows:
