@@ -4,6 +4,7 @@ import csv
 import json
 import multiprocessing
 import os
+import pickle
 import random
 import signal
 import time
@@ -289,6 +290,7 @@ def test_every_input_is_in_the_key(template: Mesh, tmp_path: Path, monkeypatch: 
         replace(job, model=replace(shape, modes=shape.modes + 1)),
     ]
     keys = [key(job) for job in jobs]
+    assert pickle.loads(pickle.dumps(job)).key(BatchItem("a", scan)) == keys[0]  # as processes of their own get it
     keys.append(key(replace(job, landmarks=None)))
     for path, text in files.items():  # none of another size or date
         state = path.stat()
