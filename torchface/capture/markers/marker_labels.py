@@ -157,18 +157,12 @@ def _known_as(channel: str, known: Mapping[str, str], bare: Mapping[str, str], f
     """The known label of a channel, its whole name or what follows a separator in it."""
     if not strip:
         return known.get(_spelled(channel, fold))
-    for rest in _suffixes(channel):
+    for begin in (0, *(separator.end() for separator in re.finditer(r"[:|/._-]", channel))):  # the longest first
+        rest = channel[begin:]
         label = known.get(_spelled(rest, fold)) or bare.get(_spelled(rest, fold))
         if label is not None:
             return label
     return None
-
-
-def _suffixes(name: str) -> Iterable[str]:
-    """A name, then what follows each separator of a subject's prefix in it, the longest first."""
-    yield name
-    for separator in re.finditer(r"[:|/._-]", name):
-        yield name[separator.end() :]
 
 
 def _bare(name: str) -> str:

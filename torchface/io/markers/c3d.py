@@ -146,12 +146,9 @@ def _positions(data: bytes, sections: Sections, path: Path) -> np.ndarray:
 
 
 def _labels(sections: Sections, points: int) -> tuple[str, ...]:
-    groups = [
-        (int(match[1] or 1), name)
-        for name in sections.parameters
-        if (match := re.fullmatch(r"POINT:LABELS([0-9]{0,3})", name))
-    ]
-    labels = [label.strip() for _, name in sorted(groups) for label in sections.texts(name)][:points]
+    found = [re.fullmatch(r"POINT:LABELS([0-9]{0,3})", name) for name in sections.parameters]
+    groups = sorted((int(one[1] or 1), one[0]) for one in found if one)
+    labels = [label.strip() for _, name in groups for label in sections.texts(name)][:points]
     return unique_labels(labels + [""] * (points - len(labels)))
 
 

@@ -137,7 +137,8 @@ def _over_brows(shown: Sequence[Shown], places: Sequence[FacePlaces], hair: Tens
 def _hairline(place: Tensor, covered: Tensor) -> Tensor:
     """Where hair begins in each column of the forehead, (17,): the height that best parts skin below from hair above,
     so that a fringe is hair and no second pair of brows."""
-    across, usual = _usual_line()
+    across = torch.linspace(-1, 1, _COLUMNS, dtype=torch.float64) * _TEMPLE
+    usual = _HAIRLINE - _FALL * (across / _TEMPLE).square()
     line = torch.stack([
         _line(place[near, 1], covered[near], height)
         for height, near in zip(usual, (place[:, :1] - across).abs().T < _COLUMN, strict=True)
@@ -243,12 +244,6 @@ def _grown(shown: FaceParts, points: Tensor, share: Tensor) -> Tensor:
     names, counts = np.unique(over, return_counts=True)
     on_head = [name for name, count in zip(names, counts, strict=True) if name and count > _TUFT]
     return torch.from_numpy(cv2.dilate(np.isin(label, on_head).astype(np.uint8), np.ones((3, 3), np.uint8)))
-
-
-def _usual_line() -> tuple[Tensor, Tensor]:
-    """Places across the forehead and how high hair usually begins there, (17,) each."""
-    across = torch.linspace(-1, 1, _COLUMNS, dtype=torch.float64) * _TEMPLE
-    return across, _HAIRLINE - _FALL * (across / _TEMPLE).square()
 
 
 def _line(heights: Tensor, hair: Tensor, usual: Tensor) -> Tensor:

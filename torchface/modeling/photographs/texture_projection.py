@@ -121,7 +121,8 @@ def photo_texture(
     confidences = (
         torch.ones(len(images), len(vertices), dtype=torch.float64) if confidence is None else confidence.cpu().double()
     )
-    squareness = torch.stack([_squareness(shown) for shown in at_vertices])
+    cosines = torch.stack([shown.cosine for shown in at_vertices])
+    squareness = ((cosines - _SQUARELY) / (1 - _SQUARELY)).clamp(min=0) ** _SHARP  # in [0,1]
     inside = torch.stack([
         _inside((shown.cosine > _SQUARELY) & (one >= _MIN_CONFIDENCE) & ~outside, graph)
         for shown, one in zip(at_vertices, confidences, strict=True)
@@ -168,11 +169,6 @@ def _outer_border(vertices: Tensor, faces: Tensor) -> Tensor:
         widths = [float((vertices[label == k].amax(0) - vertices[label == k].amin(0)).norm()) for k in names]
         result = (label == names[int(torch.tensor(widths).argmax())]) & border
     return result
-
-
-def _squareness(shown: Shown) -> Tensor:
-    """How squarely a photograph sees each vertex, (V,) in [0,1]."""
-    return ((shown.cosine - _SQUARELY) / (1 - _SQUARELY)).clamp(min=0) ** _SHARP
 
 
 def _inside(shown: Tensor, graph: VertexGraph) -> Tensor:

@@ -134,12 +134,11 @@ def video_warnings(alone: Take, predicted: Predicted) -> list[str]:
         return []
     best = int(correlation.argmax())
     seconds = (best if best < len(own) else best - size) / alone.fps
-    would = f" (by {float(correlation[best]):.2f} with `offset` in its labels {seconds:+.2f} s from now)"
+    moved = f" (by {float(correlation[best]):.2f} with `offset` in its labels {seconds:+.2f} s from now)"
     return [
         f"the video's curves and those of the markers alone correlate by {found:.2f}"
-        + (would if float(correlation[best]) > _AGREES else "")
-        + f", expected more than {_AGREES}: is it a video of this take, from its beginning on, at its true rate? "
-        "Compare with a solve without it"
+        f"{moved if float(correlation[best]) > _AGREES else ''}, expected more than {_AGREES}: is it a video of this "
+        "take, from its beginning on, at its true rate? Compare with a solve without it"
     ]
 
 
