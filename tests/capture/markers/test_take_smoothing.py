@@ -60,6 +60,18 @@ def test_without_release_it_is_the_exact_quadratic_program(
         assert whole.energy(markers, found) <= whole.energy(markers, exact) + 1e-2
 
 
+def test_a_strong_prediction_of_a_frame_leaves_the_others_as_they_are(
+    small_rig: BlendshapeRig, small_attachment: Attachment
+) -> None:
+    weights = torch.rand(6, 12, generator=torch.Generator().manual_seed(0))
+    markers = small_attachment.on(small_rig.neutral.faces, small_rig(weights.double()))
+    whole = WholeTakeSolver(MarkerSolver(small_rig, small_attachment), smoothness=0.0)
+    gamma = torch.tensor([1e6, 0, 0, 0, 0, 0])[:, None].expand(6, 12)
+    found = whole(markers, predicted=torch.full((6, 12), 0.4), gamma=gamma)
+    torch.testing.assert_close(found[:1], torch.full_like(found[:1], 0.4), rtol=0, atol=1e-3)
+    torch.testing.assert_close(found[1:], whole(markers)[1:], rtol=0, atol=1e-3)
+
+
 def test_nothing_nearby_has_less_energy_whatever_is_hidden(
     small_rig: BlendshapeRig, small_attachment: Attachment
 ) -> None:

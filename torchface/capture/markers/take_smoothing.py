@@ -186,13 +186,13 @@ class WholeTakeSolver(nn.Module):
         return self.smoothness * (fps / _REFERENCE_FPS) ** 4, self.huber_threshold * (_REFERENCE_FPS / fps) ** 2
 
     def _solve(self, markers: Tensor, smoothness: float, huber_threshold: float, pull: "_Pull | None") -> Tensor:
-        r"""Splitting: a smooth problem without bounds, then a clamp.
+        r"""Splitting: a smooth problem without bounds, then what pulls each weight by itself, and a clamp.
 
         The smooth problem has one H and one Laplacian K in all frames. A cosine transform over time diagonalises K, the
         eigenvectors of H the rest, so a step is two transforms, products and a division. What differs from frame to
         frame is on its right side, updated by majorisation, which keeps the minimum: a marker that is not seen is
-        filled in by the weights, as is what a prediction pulls less than in another frame, and the part b of a second
-        difference beyond :math:`\tau` is subtracted, :math:`h_\tau(d) = \min_b (d - b)^2 + 2\tau|b|`.
+        filled in by the weights, and the part b of a second difference beyond :math:`\tau` is subtracted,
+        :math:`h_\tau(d) = \min_b (d - b)^2 + 2\tau|b|`.
 
         Source: Boyd et al. 2011, section 5.2; Geman and Yang 1995 for b.
         """
@@ -202,8 +202,6 @@ class WholeTakeSolver(nn.Module):
         count, shapes = len(rest), rows.shape[1]
         H = (2.0 / count) * (rows.T @ rows)
         H.diagonal().add_(2 * penalty_value(solver.ridge))
-        if pull is not None:
-            H.diagonal().add_(2 * pull.most)
         smooth = _SmoothProblem.of(H, len(seen), smoothness, huber_threshold)
         gaps = torch.isnan(seen).any(-1)
         seen_mask = ~gaps[..., None]
@@ -217,9 +215,9 @@ class WholeTakeSolver(nn.Module):
             f = offset + penalty
             if len(frames):
                 f[frames] -= (torch.where(hidden, z[frames] @ rows.T, 0.0) @ rows) * (2.0 / count)
-            return f if pull is None else f - 2 * (pull.weight * pull.goal + (pull.most - pull.weight) * z)
+            return f
 
-        return smooth.least(slope, z, torch.zeros_like(z))[0]
+        return smooth.least(slope, z, torch.zeros_like(z), pull)[0]
 
     def _solve_corrected(
         self, markers: Tensor, smoothness: float, huber_threshold: float, pull: "_Pull | None"
@@ -229,20 +227,25 @@ class WholeTakeSolver(nn.Module):
         A step is taken as far as the energy falls. The start is each frame's own solution.
         """
         solver = with_sparsity(self.markers, self.sparsity)
-        data = _TakeData.of(solver, markers, pull)
+        data = _TakeData.of(solver, markers)
         rows = frames_seen(markers)
         w = interpolated(solver(markers[rows].float()), rows, len(markers)).double()  # a start needs no more digits
         H = data.hessian(w)
         smooth = _SmoothProblem.of(H, len(w), smoothness, huber_threshold)
         dual = torch.zeros_like(w)
-        value = data.value(w) + smoothness * float(_huber(w, huber_threshold))
+
+        def value_of(w: Tensor) -> float:
+            pulled = 0.0 if pull is None else float((pull.weight * (w - pull.goal).square()).sum())
+            return data.value(w) + smoothness * float(_huber(w, huber_threshold)) + pulled
+
+        value = value_of(w)
         for _ in range(_CORRECTED_STEPS):
             f = data.gradient(w) - w @ H
-            found, dual = smooth.least(lambda _, f=f: f, w, dual)  # type: ignore[misc]
+            found, dual = smooth.least(lambda _, f=f: f, w, dual, pull)  # type: ignore[misc]
             step, length = found - w, 1.0
             for _ in range(_HALVINGS):
                 there = w + length * step
-                reached = data.value(there) + smoothness * float(_huber(there, huber_threshold))
+                reached = value_of(there)
                 if reached < value:
                     break
                 length *= 0.5
@@ -314,7 +317,9 @@ class _SmoothProblem:
         divisor = values + (2 * smoothness) * bending[:, None]
         return _SmoothProblem(vectors, divisor, rho, smoothness, huber_threshold, tolerance)
 
-    def least(self, slope: Callable[[Tensor], Tensor], z: Tensor, dual: Tensor) -> tuple[Tensor, Tensor]:
+    def least(
+        self, slope: Callable[[Tensor], Tensor], z: Tensor, dual: Tensor, pull: "_Pull | None" = None
+    ) -> tuple[Tensor, Tensor]:
         """Weights (T,N) and the scaled dual there, from a start; ``slope`` gives f at weights."""
         for _ in range(_MAX_ITERATIONS):
             f = slope(z)
@@ -325,7 +330,7 @@ class _SmoothProblem:
             spectrum = _transform((self.rho * (z - dual) - f) @ self.vectors) / self.divisor
             x = _inverse_transform(spectrum) @ self.vectors.T
             v = _RELAXATION * x + (1 - _RELAXATION) * z + dual
-            before, z = z, v.clamp(0, 1)
+            before, z = z, (v if pull is None else pull.followed(v, self.rho)).clamp(0, 1)
             dual = v - z
             if float((z - before).abs().max()) < self.tolerance:
                 break
@@ -339,10 +344,9 @@ class _Pull:
     goal: Tensor
     weight: Tensor
 
-    @property
-    def most(self) -> Tensor:
-        """In any frame, (N,)."""
-        return self.weight.amax(0)
+    def followed(self, weights: Tensor, rho: Tensor) -> Tensor:
+        """The weights (T,N) that are best for the pull and, by ``rho`` (N,), near given ones."""
+        return (rho * weights + 2 * self.weight * self.goal) / (rho + 2 * self.weight)
 
     def at(self, rows: Tensor, frames: int) -> "_Pull":
         """The same where these frames are ``rows`` (T,) of more."""
@@ -358,27 +362,21 @@ class _TakeData:
     # Of frames that show all; None where a frame has gaps, whose residuals are then formed anew.
     energy: CorrectiveEnergy | None
     seen: Tensor  # in rig space, (T,M,3)
-    pull: "_Pull | None"
 
     @staticmethod
-    def of(solver: MarkerSolver, markers: Tensor, pull: "_Pull | None") -> "_TakeData":
+    def of(solver: MarkerSolver, markers: Tensor) -> "_TakeData":
         whole = None if bool(torch.isnan(markers).any()) else solver.complete_energy(markers)
         energy = whole if isinstance(whole, CorrectiveEnergy) else None
-        return _TakeData(solver, energy, solver.in_rig_space(markers), pull)
+        return _TakeData(solver, energy, solver.in_rig_space(markers))
 
     def value(self, weights: Tensor) -> float:
-        pulled = 0.0 if self.pull is None else float((self.pull.weight * (weights - self.pull.goal).square()).sum())
         if self.energy is not None:
-            return float(self.energy.value(weights).sum()) + pulled
+            return float(self.energy.value(weights).sum())
         own = self.solver.regularization(weights).value(weights).sum()
-        return float(self._residual(weights).square().sum() / self.seen.shape[1] + own) + pulled
+        return float(self._residual(weights).square().sum() / self.seen.shape[1] + own)
 
     def gradient(self, weights: Tensor) -> Tensor:
         """(T,N) at weights (T,N)."""
-        own = self._of_markers(weights)
-        return own if self.pull is None else own + 2 * self.pull.weight * (weights - self.pull.goal)
-
-    def _of_markers(self, weights: Tensor) -> Tensor:
         if self.energy is not None:
             return self.energy.gradient(weights)
         activation = self.solver.activation
@@ -395,8 +393,7 @@ class _TakeData:
         some = weights[:: max(1, len(weights) // _HESSIAN_FRAMES)]
         whole = self.solver.complete_energy(torch.zeros(len(some), *self.seen.shape[1:]).to(weights))
         assert isinstance(whole, CorrectiveEnergy)
-        H = whole.linearised(some).H.mean(0)
-        return H if self.pull is None else H + (2 * self.pull.most).diag()
+        return whole.linearised(some).H.mean(0)
 
     def _residual(self, weights: Tensor) -> Tensor:
         return (self.solver.points(weights) - self.seen).nan_to_num(0.0)

@@ -15,7 +15,7 @@ from torchface.workflows.solve.head_camera import HeadCamera
 from torchface.workflows.solve.solution import SolveSettings
 from torchface.workflows.solve.solve_take import TakeInputs, TakeOutputs, solve_take
 
-_METHOD = "solve/2"
+_METHOD = "solve/3"
 
 
 @dataclass(frozen=True)
