@@ -3,7 +3,7 @@
 import re
 from collections.abc import Sequence
 from difflib import get_close_matches
-from functools import cache
+from functools import cache, lru_cache
 from os.path import commonprefix
 
 import torch
@@ -183,7 +183,8 @@ def _canonical(name: str) -> str:
     return name.lower()
 
 
-def _meanings(names: Sequence[str]) -> list[str]:
+@lru_cache(64)  # solvers ask for each frame
+def _meanings(names: tuple[str, ...]) -> tuple[str, ...]:
     """What each is called in one spelling: other programs' names as ARKit's, where no other of the names is it."""
     meanings = [_canonical(name) for name in names]
     known, taken = {name.lower() for name in ARKIT}, set(meanings)
@@ -193,7 +194,7 @@ def _meanings(names: Sequence[str]) -> list[str]:
         if arkit and taken.isdisjoint({arkit, *_halves(arkit), *({whole} & known)}):
             meanings[row] = arkit
             taken.add(arkit)
-    return meanings
+    return tuple(meanings)
 
 
 def _halves(canonical: str) -> tuple[str, str]:
@@ -233,9 +234,9 @@ def mapping(from_names: Sequence[str], to_names: Sequence[str]) -> Tensor:
         >>> mapping(["browInnerUp", "eyeBlinkLeft"], ["eyeBlink_L", "browInnerUp_L", "browInnerUp_R"]).tolist()
         [[0.0, 1.0], [1.0, 0.0], [1.0, 0.0]]
     """
-    sources = {meaning: column for column, meaning in enumerate(_meanings(from_names))}
+    sources = {meaning: column for column, meaning in enumerate(_meanings(tuple(from_names)))}
     matrix = torch.zeros(len(to_names), len(from_names))
-    for row, wanted in enumerate(_meanings(to_names)):
+    for row, wanted in enumerate(_meanings(tuple(to_names))):
         whole = re.sub(r"(left|right)$", "", wanted)
         halves = [sources[half] for half in _halves(wanted) if half in sources]
         if wanted in sources:
@@ -285,7 +286,7 @@ def antagonists(names: Sequence[str]) -> Tensor:
         >>> antagonists(["jawLeft", "mouthSmile_L", "jawRight", "mouthSmile_R", "mouthFrown_L"]).tolist()
         [[0, 2], [1, 4]]
     """
-    row = {meaning: i for i, meaning in enumerate(_meanings(names))}
+    row = {meaning: i for i, meaning in enumerate(_meanings(tuple(names)))}
     pairs = [
         [row[one], row[other]]
         for first, second in ANTAGONISTS
