@@ -87,9 +87,14 @@ def test_highlights_are_not_the_hairs_colour(head: Mesh, camera: Camera) -> None
     picture = render(haired, camera, lighting=EVEN, samples=1)
     parts = planted_parts(picture, {"hair": HAIR, "background": torch.zeros(3)}, 0.05)
     shines = (parts.of("hair")[: picture.shape[1], : picture.shape[2]] > 0.5) & (torch.arange(300) % 8 == 0)
-    shining = torch.where(shines, 0.6, picture)
-    color = photographed_skin([head], None, [shining], [camera], FitSettings(texture_size=128, parts=[parts])).hair
-    assert float((color - HAIR).norm()) < 0.06  # their mean is 0.1 off
+    streaks = torch.where(torch.arange(300) % 2 == 0, 0.2, 1.8).expand_as(shines)
+    streaked = torch.where(parts.of("hair")[: picture.shape[1], : picture.shape[2]] > 0.5, streaks * picture, picture)
+    found = [
+        photographed_skin([head], None, [shown], [camera], FitSettings(texture_size=128, parts=[parts])).hair
+        for shown in (torch.where(shines, 0.6, picture), picture, streaked)
+    ]
+    assert float((found[0] - HAIR).norm()) < 0.06  # their mean is 0.1 off
+    assert float(found[2].mean() / found[1].mean()) == pytest.approx(1.0, abs=0.08)  # nor is the shade beside them
 
 
 def test_shadow_beside_hair_is_not_painted_and_a_mole_is(head: Mesh, camera: Camera) -> None:

@@ -26,7 +26,7 @@ _ABOVE_BROWS, _SQUARE, _HAIR = 0.06, 0.3, 0.5
 _DEEP, _SHARPLY = 5.0, 2  # pixels of the crop within hair, and the power with which they count
 _WHITE, _UNSURE = 0.1, 0.1  # of its brightness, by which the channels of white hair differ at most; its share
 _LEAST, _SHARE = 20, 0.3
-_MATT = 0.8  # share of hair without highlights
+_EXTREME = 0.2  # share of hair in highlights, and in the deepest shade
 _BEYOND, _MIDDLE = 0.2, 0.35  # share of hair in a picture above the brows, there about the face's middle
 # Of full white; shares: of hair in wide patches (leaves 0.53, hair at least 0.70), of what is green beside them.
 _GREEN, _PATCHY, _LEAFY = 0.008, 0.62, 0.2
@@ -154,7 +154,7 @@ def _hair_color(
     marks: Sequence[Tensor],
     on_head: bool,
 ) -> Tensor | None:
-    """The mean colour (3,) of hair above the brows, in its light and shade but for highlights; None without.
+    """The mean colour (3,) of hair above the brows, without highlights and the deepest shade; None without.
 
     Where none is seen on the head that was found, it may stand off it, such as a shock of it.
     """
@@ -183,8 +183,8 @@ def _hair_color(
     color, weight = torch.cat(colors, dim=1), torch.cat(weights)
     order = color.mean(0).argsort()
     total = weight[order].cumsum(0)
-    matt = order[total <= _MATT * total[-1]]
-    return (color[:, matt] @ weight[matt] / weight[matt].sum()).float()
+    usual = order[(total > _EXTREME * total[-1]) & (total <= (1 - _EXTREME) * total[-1])]
+    return (color[:, usual] @ weight[usual] / weight[usual].sum()).float()
 
 
 def _white_hair(shown: FaceParts, crop: Tensor, head: Tensor) -> Tensor:
