@@ -8,12 +8,11 @@ import pytest
 import torch
 
 from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
-from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.mirrored_points import check_mirrored
 from torchface.io import load_landmark_points
 from torchface.mesh import Mesh
 from torchface.registration import DEFAULT_SCHEDULE, Level, Schedule, Stage, register
-from torchface.registration.scan_preparation import check_landmarks, check_same_hand, prepare_scan
+from torchface.registration.scan_preparation import check_same_hand, one_side_notes, prepare_scan
 from torchface.synthetic import performer
 
 
@@ -88,14 +87,19 @@ def test_landmarks_in_another_unit_than_the_scan_are_refused(mask: Mesh, factor:
 
 def test_a_scan_of_one_side_of_the_face_is_said() -> None:
     head = performer(texture=False).neutral
-    ids = head.landmarks.cpu()
-    points = head.vertices.double()
-    least = points[ids[30], 0] - 5
-    kept = head.faces[(points[head.faces, 0] > least).all(1)]
-    note = check_landmarks((ids, points[ids]), head, SurfaceIndex(points, kept))[2]
-    words = r"WARNING: the scan shows one side .*: (\d+) of \1 landmarks at the person's right lie off it, 0 of "
-    assert re.search(words, note), note
-    assert check_landmarks((ids, points[ids]), head, SurfaceIndex(points, head.faces))[2] == ""
+    regions = head.annotations.regions
+    (warning,) = one_side_notes(head, head.vertices[:, 0] > 0)
+    parts = r"\d% of the brow \(100% at the left\), \d% of the lids \(100% at the left\), 0% of the cheek \(100% "
+    assert re.match(f"warning: at the person's right the scan shows {parts}", warning), warning
+    (warning,) = one_side_notes(head, ~regions["lids_left"])
+    assert re.match("warning: at the person's left the scan shows 0% of the lids .*at the right.: the rest", warning)
+    assert one_side_notes(head, torch.ones(len(head.vertices), dtype=torch.bool)) == []
+    assert one_side_notes(head, ~regions["forehead"]) == []
+    plain = replace(head, annotations=replace(head.annotations, regions={"face": regions["face"]}))  # ICT's template
+    (warning,) = one_side_notes(plain, head.vertices[:, 0] < 0)
+    assert re.match(
+        r"warning: at the person's left the scan shows \d% of the face \((9\d|100)% at the right\)", warning
+    )
 
 
 def test_landmarks_on_a_line_are_refused(mask: Mesh, make_mask) -> None:

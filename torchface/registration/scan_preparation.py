@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from itertools import permutations
 
 import torch
 from torch import Tensor
@@ -27,8 +26,8 @@ _UNITS = {  # by the power of ten that points are too small by
     -1: "millimetres beside a scan in centimetres",
     -3: "millimetres beside a scan in metres",
 }
-# Millimetres from the face's middle, beyond what a scan that ends 5 mm beyond it can show; share of a side's landmarks.
-_BESIDE, _ONE_SIDE = 20.0, 0.8
+_PAIRED = ("brow", "lids", "cheek")
+_ONE_SIDE = 0.65  # of what a scan shows of the other side
 _LEAST_EXTENT, _MOST_EXTENT = 0.17, 9.0  # of a template's: a scan may show less than the face or the whole person
 
 Landmarks = tuple[Tensor, Tensor]
@@ -143,7 +142,6 @@ def check_landmarks(landmarks: Landmarks, template: Mesh, scan: SurfaceIndex) ->
     if int(keep.sum()) < 3:
         why = f" ({', '.join(reasons)})" if reasons else ""
         raise ShapeError(f"landmarks: found {int(keep.sum())} that can be used of {len(ids)}{why}, expected at least 3")
-    sides = _one_side(own[present], off[present])
     ids, points, own = ids[keep], points[keep], own[keep]
     for name, cloud in (("template", own), ("scan", points)):
         singular_values = torch.linalg.svdvals(cloud - cloud.mean(0))
@@ -158,7 +156,7 @@ def check_landmarks(landmarks: Landmarks, template: Mesh, scan: SurfaceIndex) ->
             f"landmarks: the best similarity leaves {error:.1f} mm (root mean square) between the template's and the "
             f"scan's, which are {size:.0f} mm across; expected both in the same order"
         )
-    note = f"of {len(keep)} landmarks {' and '.join(reasons)}; they were left out{sides}" if reasons else ""
+    note = f"of {len(keep)} landmarks {' and '.join(reasons)}; they were left out" if reasons else ""
     return (ids, points), pose, note
 
 
@@ -178,16 +176,22 @@ def _check_size(own: Tensor, points: Tensor) -> None:
     )
 
 
-def _one_side(own: Tensor, off: Tensor) -> str:
-    """What to say where a template's landmarks (L,3) are off the scan, (L,) bool, on one side of the face only."""
-    middle = 0.5 * (own[:, 0].amin() + own[:, 0].amax())
-    left, right = own[:, 0] - middle > _BESIDE, middle - own[:, 0] > _BESIDE
-    for (name, away), (other, near) in permutations((("left", left), ("right", right))):
-        lost, kept = int((off & away).sum()), int((~off & near).sum())
-        if lost > _ONE_SIDE * int(away.sum()) and kept > _ONE_SIDE * int(near.sum()):
-            return (
-                f". WARNING: the scan shows one side of the face only: {lost} of {int(away.sum())} landmarks at the "
-                f"person's {name} lie off it, {int(near.sum()) - kept} of {int(near.sum())} at their {other}; the "
-                f"{name} side is a guess"
-            )
-    return ""
+def one_side_notes(template: Mesh, matched: Tensor) -> list[str]:
+    """A warning of parts of the face that a scan shows on one side only; matched (V,) bool is what it shows."""
+    regions = {} if template.annotations is None else template.annotations.regions
+    pairs = {part: [regions.get(f"{part}_{side}") for side in ("left", "right")] for part in _PAIRED}
+    if "face" in regions:
+        face, across = regions["face"], template.vertices[:, 0]
+        left = across > across[face].mean()
+        pairs["face"] = [face & left, face & ~left]
+    lost: dict[str, list[str]] = {"left": [], "right": []}
+    for part, masks in pairs.items():
+        shown = [float(matched[mask.cpu()].double().mean()) for mask in masks if mask is not None]
+        if len(shown) == 2 and min(shown) < _ONE_SIDE * max(shown):
+            side, other = ("left", "right") if shown[0] < shown[1] else ("right", "left")
+            lost[side].append(f"{min(shown):.0%} of the {part} ({max(shown):.0%} at the {other})")
+    return [
+        f"warning: at the person's {side} the scan shows {', '.join(parts)}: the rest is a guess"
+        for side, parts in lost.items()
+        if parts
+    ]

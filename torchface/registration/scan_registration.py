@@ -31,7 +31,7 @@ from torchface.registration.scan_colors import (
     with_edge_of_hair,
 )
 from torchface.registration.scan_completion import completed_colors, completed_form
-from torchface.registration.scan_preparation import Landmarks, PreparedScan, check_template, prepare_scan
+from torchface.registration.scan_preparation import Landmarks, check_template, one_side_notes, prepare_scan
 from torchface.registration.scan_start import Detector, StartOnScan, scale_notes, start_on_scan
 
 _NEAR = 3.0
@@ -149,7 +149,9 @@ def register(
         fit = _model_fit(shape, template, aligned, start, schedule)
         aligned, stages_left = fit.vertices, schedule.stages[1:] or schedule.stages
     deformer = Deformer(aligned, template.faces.cpu(), start.surface, start.pull, contacts, schedule)
-    cover = Cover(template, deformer.exposed, start.surface, _scan_colors(scan, start.prepared))
+    surface = start.prepared
+    colors = ScanColors(scan, surface.vertices, surface.faces, surface.face_ids) if has_colors(scan) else None
+    cover = Cover(template, deformer.exposed, start.surface, colors)
     start_distance = float(start.surface.among_nearest_samples(deformer.current[deformer.exposed]).distance.median())
     stages = []
     for number, stage in enumerate(stages_left, 1):
@@ -172,14 +174,17 @@ def register(
         nearest, unseen = _completed(deformer, template, start.surface, nearest, unseen, cover)
         matched &= ~unseen
     mesh = replace(template, vertices=deformer.current.to(template.vertices), colors=None, texture=None)
-    notes = [*start.notes, *scale_notes(start.pose), *start.pull.disagreement(deformer.current), *_model_notes(fit)]
-    notes += _final_notes(template, scan, deformer, texture_size)
+    notes = [*start.notes, *scale_notes(start.pose), *start.pull.disagreement(deformer.current)]
+    if fit is not None:
+        far = float(fit.coefficients.abs().max())
+        near = f"{fit.noise:.2f} mm (robust deviation)"
+        notes.append(f"the model comes to {near} of the scan, {far:.1f} standard deviations off")
+    notes += [*_final_notes(template, scan, deformer, texture_size), *one_side_notes(template, matched)]
     if cover.false_colors:
         notes.append(
             f"{FALSE_COLORS} ({cover.false_colors}, in logarithms): no hair or cloth was looked "
             "for by them; --no-colors leaves them out of the result too"
         )
-    colors = _scan_colors(scan, start.prepared)
     if colors is not None:
         progress("resampling the colours")
         mesh = _colored(mesh, template, colors, nearest, matched, unseen, texture_size)
@@ -208,13 +213,6 @@ def _model_fit(model: ShapeModel, template: Mesh, aligned: Tensor, start: StartO
     exposed = exposed_vertices(aligned, faces, schedule.opening).nonzero()[:, 0]
     landmarks = (start.pull.vertices, start.pull.points)
     return fit_to_scan(model, faces, aligned, exposed, start.surface, landmarks, schedule.largest_angle)
-
-
-def _model_notes(fit: ModelFit | None) -> list[str]:
-    if fit is None:
-        return []
-    far = float(fit.coefficients.abs().max())
-    return [f"the model comes to {fit.noise:.2f} mm (robust deviation) of the scan, {far:.1f} standard deviations off"]
 
 
 def _nearest(surface: SurfaceIndex, points: Tensor) -> SurfacePoints:
@@ -293,10 +291,6 @@ def _stretch(template: Mesh, current: Tensor, matched: Tensor) -> float:
     before, after = (x[first[seen]] - x[second[seen]] for x in (template.vertices.detach().cpu().double(), current))
     ratio = (after.norm(dim=-1) / before.norm(dim=-1).clamp(min=1e-9)).clamp(min=1e-9).log()
     return float((ratio - ratio.median()).abs().quantile(0.95).expm1())
-
-
-def _scan_colors(scan: Mesh, prepared: PreparedScan) -> ScanColors | None:
-    return ScanColors(scan, prepared.vertices, prepared.faces, prepared.face_ids) if has_colors(scan) else None
 
 
 def _colored(

@@ -94,6 +94,18 @@ def test_each_eye_is_judged_for_itself(
         assert re.search(note, notes[0])
 
 
+@pytest.mark.parametrize("colored", [True, False])
+def test_an_eye_that_the_scan_lacks_is_not_judged(rig: BlendshapeRig, colored: bool) -> None:
+    plain = replace(rig.neutral, texture=None, colors=None)
+    closer = exact(plain, torch.full((len(plain.vertices),), 0.1))
+    found = exact(plain, torch.ones(len(plain.vertices)))
+    found = replace(found, matched=plain.vertices[:, 0] > 0)  # the person's left half
+    scan = rig.neutral if colored else plain  # with open eyes
+    view = front_view(scan, found, rig.neutral)
+    notes = with_eye_note(rig, view, found, weights(rig, 1.0), lambda shown: closer).record.notes
+    assert re.search("scan's left eye is open, .*: --pose eyeBlinkRight=1 gives", notes[0])
+
+
 @pytest.mark.parametrize(("open_fit", "shut_fit", "shut"), [(0.27, 0.08, True), (0.1, 0.7, False), (0.1, 0.1, False)])
 def test_without_colours_two_fits_say_which_lids_they_are(
     rig: BlendshapeRig, open_fit: float, shut_fit: float, shut: bool

@@ -21,6 +21,7 @@ _BLINKS, _SIDES = ("eyeBlinkLeft", "eyeBlinkRight"), ("left", "right")
 # Likelihoods of the eye network: 0.9 and more of shut eyes, 0.08 at most of open and half shut ones.
 _SHUT, _OPEN = 0.6, 0.3
 _LIDS = 2.0  # millimetres that a blink moves skin of the lids
+_THERE = 0.5  # share of it that a scan must show: of an eye that it lacks a view says nothing
 # Mean distance of an eye's lids in the fit with shut eyes over that with open ones: with ICT's template 0.07 to 0.35
 # where they are shut, 1.6 and more where they are open; with the performer's, on ICT's heads, 0.59 to 1.15 where they
 # are shut and 0.42 to 1.92 where they are open, which says little.
@@ -37,7 +38,7 @@ def with_eye_note(
     shown: Tensor,
     other_fit: Callable[[Tensor], Registration],
 ) -> Registration:
-    """The registration, with a note of each eye of the scan that is shut though taken as open, or the other way.
+    """The registration, with a note of each eye that the scan shows shut though taken as open, or the other way.
 
     The eye network looks at a view of the scan; where the scan has no colours, or they do not show a face, the template
     is registered once more with its lids the other way.
@@ -46,10 +47,14 @@ def with_eye_note(
     if not bool(blinks.any(1).all()):
         return registration
     taken = [bool((shown[blink] > 0.5).all()) for blink in blinks]
+    lids = [
+        (rig.deltas[blink].detach().norm(dim=2).amax(0) > _LIDS).to(registration.matched.device) for blink in blinks
+    ]
     found, how = _by_texture(view), "the eye network sees"
     if found is None:
-        found, how = _by_shape(rig, registration, blinks, shown, other_fit, taken), "the lids' shape says"
-    shut = [was if saw is None else saw for was, saw in zip(taken, found, strict=True)]
+        found, how = _by_shape(lids, registration, blinks, shown, other_fit, taken), "the lids' shape says"
+    there = [bool(registration.matched[skin].double().mean() > _THERE) for skin in lids]
+    shut = [saw if saw is not None and on else was for was, saw, on in zip(taken, found, there, strict=True)]
     poses = [f"{rig.names[i]}=1" for i in blinks[torch.tensor(shut)].any(0).nonzero()[:, 0].tolist()]
     notes = []
     for state, (is_now, was_taken) in ((True, ("shut", "open")), (False, ("open", "shut"))):
@@ -116,7 +121,7 @@ def _by_texture(view: FrontView | None) -> list[bool | None] | None:
 
 
 def _by_shape(
-    rig: BlendshapeRig,
+    lids: list[Tensor],
     registration: Registration,
     blinks: Tensor,
     shown: Tensor,
@@ -132,9 +137,8 @@ def _by_shape(
     except TorchfaceError:  # what cannot be registered with other lids says nothing
         return [None, None]
     found: list[bool | None] = []
-    for blink, was_shut in zip(blinks, taken, strict=True):
-        lids = (rig.deltas[blink].detach().norm(dim=2).amax(0) > _LIDS).to(registration.distance.device)
+    for skin, was_shut in zip(lids, taken, strict=True):
         shut, open_ = (registration, other) if was_shut else (other, registration)
-        ratio = float(shut.distance[lids].mean() / open_.distance[lids].mean().clamp(min=1e-6))
+        ratio = float(shut.distance[skin].mean() / open_.distance[skin].mean().clamp(min=1e-6))
         found.append(True if ratio < _BETTER else False if ratio > _WORSE else None)
     return found
