@@ -152,16 +152,18 @@ def test_a_warning_is_one_line_without_the_sources_path() -> None:
     assert warnings.formatwarning is as_before
 
 
-def test_ctrl_c_ends_a_command_without_a_traceback() -> None:
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such signals")
+@pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])  # Ctrl-C, kill, a terminal that is closed
+def test_what_stops_a_command_lets_it_write_first(name: str) -> None:
     program = (
         "import atexit, os, signal, sys, torchface.cli as cli\n"
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell's background job ignores it
         "def info(path: str) -> None:\n"
         "    'Stops itself.'\n"
         "    try:\n"
-        "        os.kill(os.getpid(), signal.SIGINT)\n"
+        f"        os.kill(os.getpid(), signal.{name})\n"
         "    finally:\n"
-        "        os.kill(os.getpid(), signal.SIGINT)\n"  # by whom the first did not seem to help
+        f"        os.kill(os.getpid(), signal.{name})\n"  # by whom the first did not seem to help
         "        print('all is written')\n"
         "cli.COMMANDS['info'] = info\n"
         "sys.argv[1:] = ['info', '--path', 'x']\n"

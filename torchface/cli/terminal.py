@@ -83,7 +83,7 @@ def serve_page(page: "BrowserPage", line: str = "") -> None:
 
 
 def count_interrupts_once() -> None:
-    """Has a Ctrl-C soon after another do nothing: it would break off what ends the program after the first."""
+    """Ends the program on Ctrl-C, ``kill`` or a closed terminal; one soon after another would break that off."""
     before = float("-inf")
 
     def interrupt(*_: object) -> None:
@@ -92,8 +92,10 @@ def count_interrupts_once() -> None:
         if since > _ONCE:
             raise KeyboardInterrupt
 
-    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a shell's background job ignores it
-        signal.signal(signal.SIGINT, interrupt)
+    hang_up, own = getattr(signal, "SIGHUP", signal.SIGTERM), (signal.default_int_handler, signal.SIG_DFL)
+    for number in (signal.SIGINT, signal.SIGTERM, hang_up):  # Windows has no SIGHUP
+        if signal.getsignal(number) in own:  # a shell's background job ignores Ctrl-C, nohup a closed terminal
+            signal.signal(number, interrupt)
 
 
 @contextmanager

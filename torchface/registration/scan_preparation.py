@@ -190,8 +190,5 @@ def one_side_notes(template: Mesh, matched: Tensor) -> list[str]:
         if len(shown) == 2 and min(shown) < _ONE_SIDE * max(shown):
             side, other = ("left", "right") if shown[0] < shown[1] else ("right", "left")
             lost[side].append(f"{min(shown):.0%} of the {part} ({max(shown):.0%} at the {other})")
-    return [
-        f"warning: at the person's {side} the scan shows {', '.join(parts)}: the rest is a guess"
-        for side, parts in lost.items()
-        if parts
-    ]
+    said = "warning: at the person's {} the scan shows {}: the rest is a guess"
+    return [said.format(side, ", ".join(parts)) for side, parts in lost.items() if parts]

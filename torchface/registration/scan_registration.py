@@ -176,8 +176,7 @@ def register(
     mesh = replace(template, vertices=deformer.current.to(template.vertices), colors=None, texture=None)
     notes = [*start.notes, *scale_notes(start.pose), *start.pull.disagreement(deformer.current)]
     if fit is not None:
-        far = float(fit.coefficients.abs().max())
-        near = f"{fit.noise:.2f} mm (robust deviation)"
+        near, far = f"{fit.noise:.2f} mm (robust deviation)", float(fit.coefficients.abs().max())
         notes.append(f"the model comes to {near} of the scan, {far:.1f} standard deviations off")
     notes += [*_final_notes(template, scan, deformer, texture_size), *one_side_notes(template, matched)]
     if cover.false_colors:
