@@ -1,5 +1,6 @@
 """Without a rig the head of whoever is seen is solved with the take, and the weights on it."""
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -66,6 +67,8 @@ def test_the_head_is_solved_with_the_take(actor: BlendshapeRig, take: tuple[Path
         inner = posed.vertices[mean.neutral.landmarks[36:48]].double()
         assert float((camera.project(inner) - seen[36:48]).norm(dim=1).max()) < 3  # pixels: cameras went along
     assert tracked.products["head"] == tmp_path / "out" / "head.glb"
+    animation = (tmp_path / "out" / "animation.glb").read_bytes()
+    assert re.search(rb'"path": ?"rotation"', animation)  # the head turns
     assert any(line.startswith("head: solved from") for line in tracked.lines())
     save_rig(mean, tmp_path / "mean.glb")
     strangers = track_video(None, tmp_path / "mean.glb", tmp_path / "strangers", settings)

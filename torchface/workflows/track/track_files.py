@@ -15,7 +15,7 @@ from torchface.workflows.track.track_result import Tracked
 from torchface.workflows.weight_files import reduced_take, write_animation
 
 WEIGHTS, CONFIDENCE, LIVE_LINK, LANDMARKS = "weights.csv", "confidence.csv", "live_link.csv", "landmarks.csv"
-ANIMATION, OVERLAY, SUMMARY = "animation.glb", "overlay.mp4", "summary.json"
+ANIMATION, HEAD, OVERLAY, SUMMARY = "animation.glb", "head.glb", "overlay.mp4", "summary.json"
 
 SUMMARY_FORMAT = "torchface.track-summary/1"
 
@@ -68,7 +68,7 @@ def write_curves(tracked: Tracked, out: Path) -> dict[str, Path]:
     columns["presence"] = reading.presence
     track = Track(LANDMARK_NAMES, reading.landmarks, reading.confidence)
     save_landmarks_csv(Take(fps, landmarks=track, extras={"columns": columns}, seconds=when), products["landmarks"])
-    own = tracked.inputs.rig if tracked.shown is tracked.rig else None
+    own = tracked.products.get("head", tracked.inputs.rig if tracked.shown is tracked.rig else None)
     reduced = write_animation(tracked.shown, take, products["animation"], bound, own)
     if reduced is not None:
         tracked.reductions.append(f"{ANIMATION}: {reduced}")

@@ -50,13 +50,11 @@ from torchface.workflows.track.take_solution import (
     warn_of_offsets,
     with_eyes,
 )
-from torchface.workflows.track.track_files import OVERLAY, SUMMARY, summary, write_curves
+from torchface.workflows.track.track_files import HEAD, OVERLAY, SUMMARY, summary, write_curves
 from torchface.workflows.track.track_inputs import METHOD, TrackInputs, TrackSettings, load_actor, load_inputs
 from torchface.workflows.track.track_result import Tracked
 from torchface.workflows.track.track_state import TrackState
 from torchface.workflows.track.upright_rig import upright
-
-HEAD = "head.glb"
 
 
 @holds_out(within_job)
@@ -144,11 +142,11 @@ def track_video(
         cameras=[other.line for other in others],
         pictures=pictures,
     )
+    if head is not None:  # before the animation, which is made of its file
+        tracked.products["head"] = out / HEAD
+        save_rig(tracked.shown, out / HEAD, head.surface)
     with all_or_none():
         tracked.products.update(write_curves(tracked, out))
-        if head is not None:
-            tracked.products["head"] = out / HEAD
-            save_rig(tracked.shown, out / HEAD, head.surface)
     if head is not None and offsets is not None:  # other takes are tracked with the head's file
         replace(offsets, rig=rig_digest(upright(load_actor(out / HEAD, None))[0])).save(out / OFFSETS)
     if video is not None and inputs.settings.overlay != "none":
