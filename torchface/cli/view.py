@@ -25,7 +25,7 @@ def view(
 
     Args:
         rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
-        weights: A weight take to play and edit, such as a Live Link Face CSV or an animated .glb, RIG itself too.
+        weights: A weight take to play and edit, such as a Live Link Face CSV or an animated .glb, also the rig's own.
         out: Where Save writes the weights: a .csv; if absent edited_weights.csv here, or beside the take.
         port: The first port to try.
     """
