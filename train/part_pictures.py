@@ -39,5 +39,5 @@ def _render(first: int, count: int, seed: int, ict: Path | None) -> dict[str, Te
     return {name: torch.stack([getattr(picture, name) for picture in pictures]) for name in _NAMES}
 
 
-PARTS_OF_FACES = Rendering(_render, "part pictures/2", "pictures", "faces and their parts", PART)
+PARTS_OF_FACES = Rendering(_render, "part pictures/3", "pictures", "faces and their parts", PART)
 """How they are rendered, see ``rendered_files``."""

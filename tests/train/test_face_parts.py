@@ -11,6 +11,7 @@ from torchface.landmarks.images.networks.part_network import PARTS, PartNetwork
 from torchface.landmarks.images.networks.part_training import PartSettings
 from train import face_parts as recipe
 from train.face_parts import Settings, train
+from train.rendered_people import part_picture
 from train.rendered_people.head_kind import performer_kind
 from train.rendered_people.part_picture import PartPicture, draw_part_pictures
 
@@ -32,6 +33,25 @@ def test_a_face_has_its_parts_in_their_places(pictures: list[PartPicture]) -> No
     first, again = pictures[0], draw_part_pictures((performer_kind(),), (1.0,), 0, 2, seed=3, each=1, scenes=2)[0]
     assert torch.equal(first.image, again.image)
     assert torch.equal(first.parts, again.parts)
+
+
+def test_a_neckline_parts_skin_from_cloth_in_the_persons_own_colours(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(part_picture, "_BARE", 1.0)
+    shares = []
+    for picture in draw_part_pictures((performer_kind(),), (1.0,), 0, 6, seed=4, each=1, scenes=1):
+        x, y, side, _ = picture.box.tolist()
+        below = picture.parts[int(y + side) :, int(x) : int(x + side)]
+        colors = picture.image.permute(1, 2, 0).float()
+        face = picture.parts == PARTS.index("skin")
+        neck = face.clone()
+        neck[: int(y + 1.05 * side)] = False
+        if int(neck.sum()) < 200:
+            continue
+        ratio = colors[neck].mean(0) / colors[face & ~neck].mean(0)
+        assert float(ratio.max() / ratio.min()) < 1.25  # of one hue, in whatever light
+        shares.append(float((below == PARTS.index("cloth")).float().mean()))
+    assert len(shares) >= 3
+    assert max(shares) > 0.1
 
 
 def test_what_is_saved_is_what_was_learned(

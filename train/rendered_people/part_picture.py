@@ -28,6 +28,8 @@ SIZE = 160
 """Pixels a side of a picture."""
 _BOX = 72.0  # pixels a side of the face's box in it
 _ROW = {name: number for number, name in enumerate(PARTS)}
+_BARE = 0.45  # share of people with a bare neck; where all had clothes to the chin, throats were hands to the network
+_ALIKE = 0.12  # share of walls as dark or light as the hair before them
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +60,12 @@ def draw_part_pictures(
 
 
 def _dressed(person: Person, generator: torch.Generator) -> Person:
-    """Someone more likely to have glasses and a beard that hides skin."""
+    """Someone more likely to have glasses, a beard that hides skin, grey or white hair, and a bare neck."""
     looks = person.looks
+    if uniform(0, 1, generator) < 0.12:
+        looks = replace(looks, hair=torch.full((3,), uniform(0.4, 0.92, generator)))
+    if uniform(0, 1, generator) < _BARE:
+        looks = replace(looks, clothes=looks.skin)  # clothes are put on in the picture
     if uniform(0, 1, generator) < 0.25:
         lens = uniform(0.6, 0.97, generator) if uniform(0, 1, generator) < 0.4 else uniform(0, 0.12, generator)
         form = (uniform(18, 31, generator), uniform(12, 25, generator), uniform(0, 0.6, generator))
@@ -90,7 +96,24 @@ def _photograph(person: Person, generator: torch.Generator) -> tuple[np.ndarray,
         frame = with_glasses(torch.zeros_like(image), camera, marks, looks.glasses, again[0])[0][..., 3]
         lens = with_glasses(torch.ones_like(image), camera, marks, looks.glasses, again[1])[0][..., 1]
         parts[(frame > 0.4) | (lens < 0.5)] = _ROW["glasses"]
-    return image.numpy(), parts.numpy(), camera.project(marks).numpy()
+    pixels = camera.project(marks).numpy()
+    if looks.clothes is looks.skin:
+        _put_on_clothes(image, parts, pixels, looks.skin, generator)
+    return image.numpy(), parts.numpy(), pixels
+
+
+def _put_on_clothes(image: Tensor, parts: Tensor, marks: np.ndarray, skin: Tensor, generator: torch.Generator) -> None:
+    """Clothes over the lower part of a bare bust, with a neckline: round, pointed, or from shoulder to shoulder."""
+    row, column = torch.meshgrid(torch.arange(SIZE), torch.arange(SIZE), indexing="ij")
+    bust = (parts == _ROW["cloth"]) & (row > marks[8, 1])  # a cap is not
+    side = float(marks[16, 0] - marks[0, 0])
+    aside = ((column - float(marks[8, 0])).abs() / max(1.0, side * uniform(0.4, 1.6, generator))).clamp(max=1)
+    depth = side * uniform(0.15, 1.0, generator) * (1 - aside ** uniform(0.6, 3, generator))
+    bare = bust & (row < marks[8, 1] + side * uniform(0.1, 0.45, generator) + depth)
+    parts[bare] = _ROW["skin"]
+    dressed = bust & ~bare
+    cloth = torch.rand(3, generator=generator) * uniform(0.1, 1, generator)
+    image[..., :3][dressed] = (image[..., :3][dressed] * cloth / skin.clamp(min=0.1)).clamp(0, 1)
 
 
 def parts_seen(person: Person, scene: Surface, hits: Hits) -> Tensor:
@@ -130,6 +153,8 @@ def _staged(person: np.ndarray, parts: np.ndarray, marks: np.ndarray, rng: np.ra
     skin = np.median(colors[is_skin], 0) if is_skin.any() else np.array(random_color(rng, 1))
     box = box_around(torch.from_numpy(marks).float())
     face, side = (box[:2] + box[2:] / 2).numpy(), float(box[2])
+    if rng.random() < _ALIKE:
+        image = 0.25 * image + 0.75 * (hair * rng.uniform(0.6, 1.4) + rng.normal(0, 8, 3)).astype(np.float32)
     behind = np.zeros((SIZE, SIZE), np.uint8)
     if rng.random() < 0.35:
         _more_hair(behind, face, side, rng)

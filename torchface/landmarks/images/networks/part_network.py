@@ -45,7 +45,7 @@ class PartNetwork(PictureNetwork):
         (True, True)
     """
 
-    def __init__(self, channels: tuple[int, ...] = (16, 32, 64, 96), blocks: tuple[int, ...] = (1, 1, 2, 3)) -> None:
+    def __init__(self, channels: tuple[int, ...] = (16, 40, 80, 128), blocks: tuple[int, ...] = (1, 2, 3, 3)) -> None:
         super().__init__()
         if len(channels) != 4 or not all(1 <= count <= _MOST_CHANNELS for count in channels):
             raise ValueRangeError(f"channels: found {channels}, expected four numbers, 1 to {_MOST_CHANNELS} each")
