@@ -15,7 +15,7 @@ LARGEST = 2_000_000
 HOURS = {
     "eye_network": "it learns for an hour, from ICT-FaceKit's heads",
     "face_boxes": "it learns from ICT-FaceKit's heads, in two parts of which the command makes one",
-    "face_parts": "it learns for half an hour, from ICT-FaceKit's heads",
+    "face_parts": "it learns for an hour, from ICT-FaceKit's heads",
     "landmark_network": "it learns for hours, from ICT-FaceKit's heads, and its pictures changed while it did",
 }
 

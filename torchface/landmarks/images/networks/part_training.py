@@ -26,9 +26,9 @@ _RARE = torch.tensor([1.0, 1.0, 1.0, 2.0, 2.0, 2.0, 2.0, 2.0, 1.0, 1.0])  # of b
 class PartSettings(DescentSettings):
     """How a network of parts is trained."""
 
-    steps: int = 3000
+    steps: int = 9000
     batch: int = 24
-    rate: float = 3e-3
+    rate: float = 4e-3
     turn: float = 9.0  # standard deviation of a face's tilt in its crop, degrees
     scale: float = 0.2  # how much larger or smaller than its box a face may be, as a logarithm
     shift: float = 0.06  # standard deviation of its place, of the box
