@@ -19,7 +19,7 @@ from train import prior_takes
 from train.prior_takes import read_takes, renamed, split, synthetic_takes
 from train.priors import Settings, train
 
-ICT_LIKE = ("browInnerUp_L", "browInnerUp_R", "eyeBlink_L", "eyeBlink_R", "jawOpen", "cheekRaiser_L")
+ICT_LIKE = ("browInnerUp_L", "browInnerUp_R", "eyeBlink_L", "eyeBlink_R", "jawOpen", "cheekRaiser_L", "earWiggle_L")
 
 
 def saved(folder: Path, name: str, frames: int = 160, seed: int = 0, fps: float = 60.0) -> Take:
@@ -93,11 +93,13 @@ def test_the_papers_form_with_a_bandwidth(folder: Path, tmp_path: Path) -> None:
 def test_names_of_another_rig(folder: Path, tmp_path: Path) -> None:
     takes, silent = renamed(read_takes(folder, tmp_path), ICT_LIKE)
     assert takes.names == ICT_LIKE
-    assert silent == ("cheekRaiser_L",)
+    assert silent == ("earWiggle_L",)
     own = read_takes(folder, tmp_path)
     brow = own.weights[0][:, [name.lower() for name in own.names].index("browinnerup")]
     for column in (0, 1):
         torch.testing.assert_close(takes.weights[0][:, column], brow)
+    cheek = own.weights[0][:, [name.lower() for name in own.names].index("cheeksquintleft")]
+    torch.testing.assert_close(takes.weights[0][:, 5], cheek)  # by its meaning
     with pytest.raises(NameMismatchError, match="none of which the takes have"):
         renamed(own, ["left", "right"])
 
