@@ -16,6 +16,7 @@ from torchface.shape_names import ARKIT, mirror
 CropNetwork = Callable[[Tensor], NetworkLandmarks]  # crops (B,3,S,S) float32 in [0,1], red first, to what they show
 
 _NO_POINTS = torch.zeros(0, dtype=torch.int64)
+_TWINS = mirror(ARKIT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,7 +29,7 @@ class BothSides:
     def __call__(self, crops: Tensor) -> NetworkLandmarks:
         last = crops.shape[-1] - 1
         upright, mirrored = self.network(crops), self.network(crops.flip(-1).contiguous())
-        rows, twins = list(MIRROR_68), mirror(ARKIT)
+        rows, twins = list(MIRROR_68), _TWINS
         landmarks, deviation = _merged(upright[:2], (mirrored.landmarks[:, rows], mirrored.deviation[:, rows]), last)
         across = mirrored.points[:, self.mirror], mirrored.point_deviation[:, self.mirror]
         points, point_deviation = _merged(upright[4:6], across, last)
