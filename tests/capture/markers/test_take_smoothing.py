@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, Track
 from torchface.capture import MarkerSolver, WholeTakeSolver
-from torchface.capture.markers.take_smoothing import curvature
+from torchface.capture.markers.smooth_problem import curvature
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.optim import box_qp

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from torchface.capture.markers.take_smoothing import smooth_in_box
+from torchface.capture.markers.smooth_problem import smooth_in_box
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.rotations import cross_matrix
 from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE, Similarity, similarity_transform

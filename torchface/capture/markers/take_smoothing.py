@@ -2,17 +2,16 @@
 
 import copy
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import torch
-from scipy.fft import dct, idct
 from torch import Tensor, nn
 
 from torchface.capture.corrective_energy import CorrectiveEnergy
 from torchface.capture.markers.given_markers import frames_seen, markers_of
 from torchface.capture.markers.hybrid_solver import check_predictions, in_rig_order
 from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
+from torchface.capture.markers.smooth_problem import HUBER_THRESHOLD, REFERENCE_FPS, Pull, SmoothProblem, huber
 from torchface.errors import ShapeError, TraceError, ValueRangeError
 from torchface.number_checks import LARGEST_WEIGHT, check_rate, checked_number, checked_type
 from torchface.optim.data_dependent import data_dependent
@@ -22,17 +21,9 @@ from torchface.temporal.frame_grid import frame_grid
 
 SMOOTHNESS = 10.0
 """At 60 frames a second, mm² a marker for a squared second difference of 1: noise of 0.3 mm hardly shows."""
-HUBER_THRESHOLD = 0.005
-"""At 60 frames a second, in weights: larger second differences count linearly, so that blinks keep their height."""
 # Neighbouring frames regularise, so a tenth of a single frame's L1 penalty is enough.
 SPARSITY_RATIO = 0.1
 
-_RHO, _RELAXATION = 0.12, 1.8
-_MAX_ITERATIONS, _TOLERANCE = 400, 2e-4
-# From a start near the end, of equations without noise, each weight has a step of its own, so that a third of the
-# iterations comes as near.
-_RHO_NEAR, _TOLERANCE_NEAR = 0.1, 1e-3
-_REFERENCE_FPS = 60.0
 # With correctives: steps at most, halvings of each, frames whose mean curvature stands for all, and the share of the
 # energy that a step has to take off for another to follow.
 _CORRECTED_STEPS, _HALVINGS, _HESSIAN_FRAMES, _LEAST_FALL = 20, 6, 64, 1e-4
@@ -114,7 +105,7 @@ class WholeTakeSolver(nn.Module):
     def forward(
         self,
         markers: Tensor,
-        fps: float = _REFERENCE_FPS,
+        fps: float = REFERENCE_FPS,
         seconds: Tensor | None = None,
         predicted: Tensor | None = None,
         gamma: Tensor | None = None,
@@ -159,16 +150,16 @@ class WholeTakeSolver(nn.Module):
             on_grid = None if pull is None else pull.at(rows, len(grid))
             return solve(grid, smoothness * fps / rate, huber_threshold, on_grid)[rows].to(markers.dtype)
 
-    def _pull(self, frames: int, predicted: Tensor | None, gamma: Tensor | None) -> "_Pull | None":
+    def _pull(self, frames: int, predicted: Tensor | None, gamma: Tensor | None) -> "Pull | None":
         if predicted is None or gamma is None:
             if predicted is not gamma:
                 raise ShapeError("predicted and gamma: found one of them, expected both or none")
             return None
         check_predictions(predicted, gamma, (frames, len(self.markers.names)))
         counts = gamma > 0
-        return _Pull(torch.where(counts, predicted, 0.0).double(), gamma.double() / len(self.markers.rest))
+        return Pull(torch.where(counts, predicted, 0.0).double(), gamma.double() / len(self.markers.rest))
 
-    def energy(self, markers: Tensor, weights: Tensor, fps: float = _REFERENCE_FPS) -> float:
+    def energy(self, markers: Tensor, weights: Tensor, fps: float = REFERENCE_FPS) -> float:
         """What the solve minimises, over all frames, without predictions."""
         smoothness, huber_threshold = self._scaled(fps)
         solver = self.markers
@@ -176,16 +167,15 @@ class WholeTakeSolver(nn.Module):
         w = weights.double()
         points = solver.points(w)
         data = (points - seen).square().sum(-1).nan_to_num(0.0).sum() / points.shape[1]
-        huber = _huber(w, huber_threshold)
-        penalty = self.sparsity
-        return float(data + penalty * w.sum() + penalty_value(solver.ridge) * w.square().sum() + smoothness * huber)
+        own = self.sparsity * w.sum() + penalty_value(solver.ridge) * w.square().sum()
+        return float(data + own + smoothness * huber(w, huber_threshold))
 
     def _scaled(self, fps: float) -> tuple[float, float]:
         """A second difference of the same motion falls with the square of the frame rate."""
         check_rate(fps, "fps", ValueRangeError)
-        return self.smoothness * (fps / _REFERENCE_FPS) ** 4, self.huber_threshold * (_REFERENCE_FPS / fps) ** 2
+        return self.smoothness * (fps / REFERENCE_FPS) ** 4, self.huber_threshold * (REFERENCE_FPS / fps) ** 2
 
-    def _solve(self, markers: Tensor, smoothness: float, huber_threshold: float, pull: "_Pull | None") -> Tensor:
+    def _solve(self, markers: Tensor, smoothness: float, huber_threshold: float, pull: "Pull | None") -> Tensor:
         r"""Splitting: a smooth problem without bounds, then what pulls each weight by itself, and a clamp.
 
         The smooth problem has one H and one Laplacian K in all frames. A cosine transform over time diagonalises K, the
@@ -202,7 +192,7 @@ class WholeTakeSolver(nn.Module):
         count, shapes = len(rest), rows.shape[1]
         H = (2.0 / count) * (rows.T @ rows)
         H.diagonal().add_(2 * penalty_value(solver.ridge))
-        smooth = _SmoothProblem.of(H, len(seen), smoothness, huber_threshold)
+        smooth = SmoothProblem.of(H, len(seen), smoothness, huber_threshold)
         gaps = torch.isnan(seen).any(-1)
         seen_mask = ~gaps[..., None]
         offset = torch.where(seen_mask, rest - seen.nan_to_num(0.0), 0.0).flatten(1) @ rows * (2.0 / count)
@@ -220,7 +210,7 @@ class WholeTakeSolver(nn.Module):
         return smooth.least(slope, z, torch.zeros_like(z), pull)[0]
 
     def _solve_corrected(
-        self, markers: Tensor, smoothness: float, huber_threshold: float, pull: "_Pull | None"
+        self, markers: Tensor, smoothness: float, huber_threshold: float, pull: "Pull | None"
     ) -> Tensor:
         """With correctives: steps to the least of the problem above, with the mean frame's H in place of each frame's.
 
@@ -231,12 +221,12 @@ class WholeTakeSolver(nn.Module):
         rows = frames_seen(markers)
         w = interpolated(solver(markers[rows].float()), rows, len(markers)).double()  # a start needs no more digits
         H = data.hessian(w)
-        smooth = _SmoothProblem.of(H, len(w), smoothness, huber_threshold)
+        smooth = SmoothProblem.of(H, len(w), smoothness, huber_threshold)
         dual = torch.zeros_like(w)
 
         def value_of(w: Tensor) -> float:
             pulled = 0.0 if pull is None else float((pull.weight * (w - pull.goal).square()).sum())
-            return data.value(w) + smoothness * float(_huber(w, huber_threshold)) + pulled
+            return data.value(w) + smoothness * float(huber(w, huber_threshold)) + pulled
 
         value = value_of(w)
         for _ in range(_CORRECTED_STEPS):
@@ -269,89 +259,6 @@ def with_sparsity(solver: MarkerSolver, sparsity: float) -> MarkerSolver:
     other.sparsity = float(sparsity)
     other.regularization(solver.rest)
     return other
-
-
-def smooth_in_box(H: Tensor, slopes: Tensor, fps: float, smoothness: float) -> Tensor:
-    r"""Weights (T,N) in [0,1] of frames of one H (N,N) and slopes f (T,N), calm as :class:`WholeTakeSolver`'s.
-
-    Args:
-        smoothness: :math:`\lambda` at 60 frames a second, in the unit of the energies.
-
-    Example:
-        >>> steps = torch.tensor([0.0, 0.0, 1.0, 1.0], dtype=torch.float64)[:, None]
-        >>> smooth_in_box(2 * torch.eye(1, dtype=torch.float64), -2 * steps, 60.0, 0.0)[:, 0].round(decimals=2).tolist()
-        [0.0, 0.0, 1.0, 1.0]
-    """
-    check_rate(fps, "fps", ValueRangeError)
-    own, threshold = smoothness * (fps / _REFERENCE_FPS) ** 4, HUBER_THRESHOLD * (_REFERENCE_FPS / fps) ** 2
-    start = (-torch.linalg.solve(H, slopes.T).T).clamp(0, 1)
-    own_steps = _RHO_NEAR * (H.diagonal() * H.diagonal().mean()).sqrt()
-    problem = _SmoothProblem.of(H, len(slopes), own, threshold, own_steps, _TOLERANCE_NEAR)
-    return problem.least(lambda _: slopes, start, torch.zeros_like(slopes))[0]
-
-
-@dataclass(frozen=True, eq=False)
-class _SmoothProblem:
-    r"""The smooth part of the problem in the basis that makes it diagonal: eigenvectors of H and the steps, cosines."""
-
-    vectors: Tensor
-    divisor: Tensor
-    rho: Tensor
-    smoothness: float
-    huber_threshold: float
-    tolerance: float
-
-    @staticmethod
-    def of(
-        H: Tensor,
-        frames: int,
-        smoothness: float,
-        huber_threshold: float,
-        rho: Tensor | None = None,
-        tolerance: float = _TOLERANCE,
-    ) -> "_SmoothProblem":
-        rho = _RHO * H.diagonal().mean().expand(len(H)) if rho is None else rho
-        values, vectors = torch.linalg.eigh(H + rho.diag())
-        waves = torch.arange(frames, dtype=H.dtype, device=H.device) * (math.pi / frames)
-        bending = (2 - 2 * torch.cos(waves)).square()
-        divisor = values + (2 * smoothness) * bending[:, None]
-        return _SmoothProblem(vectors, divisor, rho, smoothness, huber_threshold, tolerance)
-
-    def least(
-        self, slope: Callable[[Tensor], Tensor], z: Tensor, dual: Tensor, pull: "_Pull | None" = None
-    ) -> tuple[Tensor, Tensor]:
-        """Weights (T,N) and the scaled dual there, from a start; ``slope`` gives f at weights."""
-        for _ in range(_MAX_ITERATIONS):
-            f = slope(z)
-            if self.huber_threshold != math.inf:
-                difference = curvature(z)
-                excess = difference.sign() * (difference.abs() - self.huber_threshold).clamp(min=0)
-                f = f - 2 * self.smoothness * curvature(excess)
-            spectrum = _transform((self.rho * (z - dual) - f) @ self.vectors) / self.divisor
-            x = _inverse_transform(spectrum) @ self.vectors.T
-            v = _RELAXATION * x + (1 - _RELAXATION) * z + dual
-            before, z = z, (v if pull is None else pull.followed(v, self.rho)).clamp(0, 1)
-            dual = v - z
-            if float((z - before).abs().max()) < self.tolerance:
-                break
-        return z, dual
-
-
-@dataclass(frozen=True, eq=False)
-class _Pull:
-    """What predictions ask of each frame: weights (T,N) near goals (T,N), over all markers."""
-
-    goal: Tensor
-    weight: Tensor
-
-    def followed(self, weights: Tensor, rho: Tensor) -> Tensor:
-        """The weights (T,N) that are best for the pull and, by ``rho`` (N,), near given ones."""
-        return (rho * weights + 2 * self.weight * self.goal) / (rho + 2 * self.weight)
-
-    def at(self, rows: Tensor, frames: int) -> "_Pull":
-        """The same where these frames are ``rows`` (T,) of more."""
-        empty = self.goal.new_zeros(frames, self.goal.shape[1])
-        return _Pull(empty.index_copy(0, rows, self.goal), empty.index_copy(0, rows, self.weight))
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,25 +304,3 @@ class _TakeData:
 
     def _residual(self, weights: Tensor) -> Tensor:
         return (self.solver.points(weights) - self.seen).nan_to_num(0.0)
-
-
-def _huber(weights: Tensor, threshold: float) -> Tensor:
-    """The sum of Huber's function of all second differences."""
-    size = curvature(weights).abs()
-    if threshold == math.inf:
-        return size.square().sum()
-    return torch.where(size <= threshold, size.square(), 2 * threshold * size - threshold * threshold).sum()
-
-
-def curvature(weights: Tensor) -> Tensor:
-    """Second differences over time with their sign turned, (T,N); at both ends the curve counts as mirrored."""
-    padded = torch.cat([weights[:1], weights, weights[-1:]])
-    return 2 * weights - padded[2:] - padded[:-2]
-
-
-def _transform(x: Tensor) -> Tensor:
-    return torch.from_numpy(dct(x.cpu().numpy(), type=2, norm="ortho", axis=0)).to(x.device)
-
-
-def _inverse_transform(x: Tensor) -> Tensor:
-    return torch.from_numpy(idct(x.cpu().numpy(), type=2, norm="ortho", axis=0)).to(x.device)
