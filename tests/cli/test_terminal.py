@@ -157,7 +157,9 @@ def test_a_warning_is_one_line_without_the_sources_path() -> None:
 def test_what_stops_a_command_lets_it_write_first(name: str) -> None:
     program = (
         "import atexit, os, signal, sys, torchface.cli as cli\n"
-        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"  # a shell's background job ignores it
+        # A shell's background job ignores Ctrl-C, nohup a closed terminal.
+        f"signal.signal(signal.{name}, signal.SIG_DFL)\n"
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "def info(path: str) -> None:\n"
         "    'Stops itself.'\n"
         "    try:\n"
