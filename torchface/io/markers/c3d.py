@@ -91,7 +91,7 @@ def _first_frame(sections: Sections) -> int:
     return sections.header.first_frame
 
 
-def _frame_counts(sections: Sections, room: int) -> list[float]:
+def _frame_counts(sections: Sections, stored: int) -> list[float]:
     """What the file's fields say, the most reliable first; 16 bits of them end at 65,535 or begin again from 0."""
     header = sections.header
     last = sections.numbers("TRIAL:ACTUAL_END_FIELD")
@@ -99,9 +99,9 @@ def _frame_counts(sections: Sections, room: int) -> list[float]:
     counts = [last[0] + 65536 * last[1] - _first_frame(sections) + 1] if len(last) >= 2 else []
     counts += [count for count in stated if count > _MAX_COUNT]
     if header.last_frame == _MAX_COUNT:
-        return [*counts, room, *stated]
+        return [*counts, stored, *stated]
     count = (header.last_frame - header.first_frame + 1) % 65536
-    return [*counts, 65536 if count == 0 and room > _MAX_COUNT else count, *stated]
+    return [*counts, 65536 if count == 0 and stored > _MAX_COUNT else count, *stated]
 
 
 def _positions(data: bytes, sections: Sections, path: Path) -> np.ndarray:
@@ -116,21 +116,21 @@ def _positions(data: bytes, sections: Sections, path: Path) -> np.ndarray:
         raise FileFormatError(f"{path}: found the data in block {first_block:g}, expected block 3 or later")
     start = BLOCK * (int(first_block) - 1)
     frame_size = word * (4 * header.points + header.analog)
-    room = max(0, len(data) - start) // frame_size
+    stored = max(0, len(data) - start) // frame_size
     zeros = BLOCK - len(data[-BLOCK:].rstrip(b"\0"))  # that fill the last block, or the end of the last frame
-    full = min(room, -((start - len(data) + zeros) // frame_size))
+    full = min(stored, -((start - len(data) + zeros) // frame_size))
     counts = [count for count in _frame_counts(sections, full) if count >= 1 and float(count).is_integer()]
     if not counts:
         raise FileFormatError(f"{path}: found no frames, expected at least one")
-    fitting = [int(count) for count in counts if count <= room]
+    fitting = [int(count) for count in counts if count <= stored]
     if not fitting:
         raise FileFormatError(
-            f"{path}: found {counts[0]:.0f} frames of {frame_size} bytes announced and room for {room} behind byte "
+            f"{path}: found {counts[0]:.0f} frames of {frame_size} bytes announced and room for {stored} behind byte "
             f"{start}, expected all of them; is the file cut off?"
         )
     frames = fitting[0]
     if frames <= _MAX_COUNT:
-        frames += (room - frames) // 65536 * 65536  # 16 bits began again
+        frames += (stored - frames) // 65536 * 65536  # 16 bits began again
     rows = np.frombuffer(data, np.uint8, frames * frame_size, start).reshape(frames, frame_size)
     block = np.ascontiguousarray(rows[:, : 4 * word * header.points])
     if word == 4:
