@@ -203,6 +203,17 @@ def test_the_help_shows_one_value_where_an_option_is_given_again_for_each(
 
 
 @pytest.mark.parametrize(
+    ("command", "places"), [("view", "RIG [WEIGHTS]"), ("pick", "MESH [SCAN]"), ("convert", "FILE OUT")]
+)
+def test_the_help_calls_every_place_by_its_own_name(
+    command: str, places: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        main([command, "--help"])
+    assert re.search(rf"usage: torchface {command} .*{re.escape(places)}", " ".join(capsys.readouterr().out.split()))
+
+
+@pytest.mark.parametrize(
     ("words", "hint"),
     [
         ("live 0 --to osc://a:1 vmc://b:2", "again for each: --to osc://a:1 --to vmc://b:2"),

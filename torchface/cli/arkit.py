@@ -1,9 +1,8 @@
 """``torchface arkit``: ARKit's shapes on any head, and its animations as ARKit weights."""
 
 from pathlib import Path
-from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from torchface.cli.command_options import OutputPath
 from torchface.cli.progress_bars import progress_bars
@@ -11,7 +10,7 @@ from torchface.cli.terminal import Quiet, print_lines, print_path
 
 
 def arkit(
-    source: Annotated[Positional[Path], arg(metavar="SOURCE")],
+    source: Positional[Path],
     out: OutputPath,
     animation: Path | None = None,
     weights: Path | None = None,

@@ -19,7 +19,7 @@ _COLUMNS = (
 
 
 def attach(
-    rig: Annotated[Positional[Path], arg(metavar="RIG")],
+    rig: Positional[Path],
     rom: Annotated[Positional[tuple[Path, ...]], arg(metavar="ROM...")],
     out: OutputPath = Path("attachment.json"),
     initial: Path | None = None,

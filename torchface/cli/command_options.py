@@ -158,6 +158,8 @@ def plain_options(command: Command) -> Command:
         changes: dict[str, Any] = {"help_behavior_hint": ""} if empty else {}
         if UseAppendAction in notes:  # one value for each time that it is given
             changes["metavar"] = _WORDS[get_args(kind)[0]]
+        elif Positional in notes and not named:
+            changes["metavar"] = name.upper() if parameter.default is parameter.empty else f"[{name.upper()}]"
         elif not named and (word := _word(kind)):
             changes["metavar"] = word
         if parameter.default is False and not is_dataclass(command):  # whose defaults may come from a file

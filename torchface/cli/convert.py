@@ -12,7 +12,7 @@ from torchface.cli.terminal import Quiet, console, print_lines, print_path
 
 def convert(
     source: Annotated[Positional[Path], arg(metavar="FILE")],
-    out: Annotated[Positional[OutputPath], arg(metavar="OUT")],
+    out: Positional[OutputPath],
     unit: str | None = None,
     part: str | None = None,
     names: Literal["arkit"] | None = None,

@@ -1,9 +1,9 @@
 """``torchface corrective``: a corrective from a sculpted mesh."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from torchface.cli.command_options import OutputPath
 from torchface.cli.progress_bars import progress_bars
@@ -11,7 +11,7 @@ from torchface.cli.terminal import Quiet, print_lines, print_path
 
 
 def corrective(
-    rig: Annotated[Positional[Path], arg(metavar="RIG")],
+    rig: Positional[Path],
     at: tuple[str, ...],
     sculpt: Path,
     out: OutputPath,

@@ -4,7 +4,7 @@ from pathlib import Path
 from typing import Annotated
 
 from rich.table import Table
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from torchface.cli.batch_report import Cluster, Column, Jobs, TimeLimit, work_on
 from torchface.cli.command_options import Output
@@ -24,8 +24,8 @@ _FILES = ("regions.csv", "frames.csv", "shapes.csv", "methods.csv")
 
 
 def evaluate(
-    result: Annotated[Positional[Path], arg(metavar="RESULT")],
-    truth: Annotated[Positional[Path], arg(metavar="TRUTH")],
+    result: Positional[Path],
+    truth: Positional[Path],
     out: Annotated[Path, Output(_FILES)] = Path("out/evaluation"),
     rig: Path | None = None,
     truth_rig: Path | None = None,

@@ -1,9 +1,8 @@
 """``torchface examples``: a person's example expressions, or a rig's, for the solve from landmarks."""
 
 from pathlib import Path
-from typing import Annotated
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from torchface.cli.command_options import OutputPath
 from torchface.cli.progress_bars import progress_bars
@@ -11,7 +10,7 @@ from torchface.cli.terminal import Quiet, console, print_lines, print_path
 
 
 def examples(
-    pictures: Annotated[Positional[tuple[Path, ...]], arg(metavar="PICTURES")] = (),
+    pictures: Positional[tuple[Path, ...]] = (),
     *,
     out: OutputPath,
     camera: str | None = None,

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from torchface.cli.command_options import Output, OutputPath, Part
 from torchface.cli.progress_bars import progress_bars
@@ -14,7 +14,7 @@ Method = Literal["splitting", "projected-gradient"]
 
 
 def solver(
-    rig: Annotated[Positional[Path], arg(metavar="RIG")],
+    rig: Positional[Path],
     attachment: Path,
     out: OutputPath,
     method: Method = "splitting",
@@ -56,9 +56,7 @@ def solver(
     print_path(out)
 
 
-def action_units(
-    model: Annotated[Positional[str], arg(metavar="MODEL")], out: OutputPath, quiet: Quiet = False
-) -> None:
+def action_units(model: Positional[str], out: OutputPath, quiet: Quiet = False) -> None:
     """Write an action unit classifier as an ONNX file, and check it.
 
     Inputs of the graph: `regions` (B,R,h,w), painted patterns in [0,1], and `rest` (R,h,w), the same of the face at
@@ -83,7 +81,7 @@ def action_units(
 
 
 def video_solver(
-    rig: Annotated[Positional[Path], arg(metavar="RIG")],
+    rig: Positional[Path],
     camera: Path,
     out: OutputPath,
     prior: str | None = None,
@@ -152,7 +150,7 @@ def video_solver(
 
 
 def examples(
-    examples: Annotated[Positional[Path], arg(metavar="EXAMPLES")],
+    examples: Positional[Path],
     out: OutputPath,
     solver: Literal["all-at-once", "regional", "model"] = "all-at-once",
     quiet: Quiet = False,

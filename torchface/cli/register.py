@@ -12,7 +12,7 @@ from torchface.cli.terminal import Quiet
 
 
 def register(
-    template: Annotated[Positional[Path], arg(metavar="TEMPLATE")],
+    template: Positional[Path],
     scans: Annotated[Positional[tuple[Path, ...]], arg(metavar="SCAN...")],
     out: OutputPath,
     landmarks: Path | None = None,

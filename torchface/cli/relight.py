@@ -1,9 +1,9 @@
 """``torchface relight``: a tracked face under another light, with another skin or another head."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from torchface.cli.command_options import OutputPath
 from torchface.cli.progress_bars import progress_bars
@@ -11,7 +11,7 @@ from torchface.cli.terminal import Quiet, print_lines, print_path
 
 
 def relight(
-    film: Annotated[Positional[Path], arg(metavar="FILM")],
+    film: Positional[Path],
     track: Path,
     out: OutputPath = Path("relit.mp4"),
     light: tuple[str, ...] = (),

@@ -13,7 +13,7 @@ _MAX_NAMES = 12
 
 
 def retarget(
-    weights: Annotated[Positional[Path], arg(metavar="WEIGHTS")],
+    weights: Positional[Path],
     to: Path,
     from_: Annotated[Path | None, arg(name="from")] = None,
     table: Path | None = None,

@@ -20,7 +20,7 @@ _COLUMNS = (
 
 
 def solve(
-    rig: Annotated[Positional[Path], arg(metavar="RIG")],
+    rig: Positional[Path],
     take: Annotated[Positional[tuple[Path, ...]], arg(metavar="TAKE...")],
     attachment: Path,
     out: OutputPath = Path("out/weights.csv"),

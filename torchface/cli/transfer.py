@@ -1,9 +1,9 @@
 """``torchface transfer``: a template's shapes on another head."""
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
-from tyro.conf import Positional, arg
+from tyro.conf import Positional
 
 from torchface.cli.command_options import OutputPath
 from torchface.cli.progress_bars import progress_bars
@@ -11,8 +11,8 @@ from torchface.cli.terminal import Quiet, console, print_lines, print_path
 
 
 def transfer(
-    template: Annotated[Positional[Path], arg(metavar="TEMPLATE")],
-    neutral: Annotated[Positional[Path], arg(metavar="NEUTRAL")],
+    template: Positional[Path],
+    neutral: Positional[Path],
     out: OutputPath,
     part: str | None = None,
     unit: str | None = None,

@@ -50,7 +50,7 @@ def list_models() -> None:
         page.print(f"{name}: {fault}", style="bold yellow", highlight=False, soft_wrap=True)
 
 
-def describe(name: Annotated[Positional[str], arg(metavar="NAME")]) -> None:
+def describe(name: Positional[str]) -> None:
     """Show what is known of one learned model, without loading it.
 
     Its kind and class, size, licence, the data that it has learned from, what was measured on data held out, the
