@@ -71,6 +71,13 @@ def test_proposals_are_the_frames_that_differ_and_wait_for_the_next_run(
     assert [frame.name for frame in more.frames][:5] == [frame.name for frame in found.frames]
 
 
+def test_fewer_frames_than_asked_for_are_said(video: Path, tracker: Tracker, tmp_path: Path) -> None:
+    for _ in range(2):  # the second reads what the first has kept
+        with pytest.warns(UserWarning, match=r"actor\.avi: found 14 of 14 frames, 20 were asked for"):
+            assert len(prepare_annotation(video, tmp_path, tracker, 20).frames) == 14
+    assert tracker.asked == 1
+
+
 def test_what_was_saved_comes_back_and_is_kept(video: Path, tracker: Tracker, tmp_path: Path) -> None:
     found = prepare_annotation(video, tmp_path, tracker, 4)
     session = AnnotationSession(found.frames, tmp_path, found.saved)

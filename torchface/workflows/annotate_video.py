@@ -1,5 +1,6 @@
 """Frames of a video to be annotated: tracked, chosen so that they span what the face does, kept for a resumed run."""
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,6 +55,12 @@ def prepare_annotation(video: Path, folder: Path, track: Tracker, count: int = 1
         _write(folder, opened, proposed)
     wanted = list(proposed.landmarks)[:count]
     wanted += [i for i in proposed.landmarks if i not in wanted and _points(folder, opened, i).is_file()]
+    if len(proposed.landmarks) < count:
+        warnings.warn(
+            f"{video.name}: found {len(proposed.landmarks)} of {opened.count} frames, {count} were asked for: "
+            "frames without a sure face, or like another one, are left out",
+            stacklevel=2,
+        )
     images = _images(opened, wanted)
     frames, saved = [], []
     for number in wanted:
