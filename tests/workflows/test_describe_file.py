@@ -125,6 +125,15 @@ def test_triangles_without_area_are_counted_where_a_rig_is_described(tmp_path: P
     assert "triangles without area" not in dict(describe(tmp_path / "whole.glb"))
 
 
+def test_shapes_that_move_the_whole_mesh_are_said(tmp_path: Path) -> None:
+    rig = performer(texture=False).select(["jawOpen", "jawLeft"])
+    save_rig(BlendshapeRig(rig.neutral, rig.deltas + torch.tensor([0.0, 9.0, 0.0]), rig.names), tmp_path / "rig.glb")
+    assert "warning" not in dict(describe(tmp_path / "rig.glb"))  # an expression besides
+    deltas = torch.stack([rig.deltas[0], torch.tensor([3.0, 0.0, 4.0]).expand_as(rig.vertices)])
+    save_rig(BlendshapeRig(rig.neutral, deltas, rig.names), tmp_path / "rig.glb")
+    assert "all vertices alike in jawLeft (5.0 mm)" in dict(describe(tmp_path / "rig.glb"))["warning"]
+
+
 def test_heads_beside_each_other_are_listed_and_one_head_is_not(tmp_path: Path) -> None:
     rig = performer(texture=False)
     count, apart = len(rig.vertices), torch.tensor([400.0, 0.0, 0.0])

@@ -55,6 +55,7 @@ Rows = list[tuple[str, str]]
 _MAX_LENGTH = 240
 _LENGTH, _LONGEST_HEADER = "_mm", 4096  # ends the names of columns that are no weights
 _MAX_NAMED, _MAX_LISTED = 8, 10
+_ALIKE = 0.01  # of a shape's motion: by no more its vertices differ where it moves the whole mesh
 _LANDMARK_ENDINGS = (".ljson", ".pts", ".xml")
 _ARRAY_ENDINGS = (".npz", ".npy", ".safetensors")
 
@@ -262,6 +263,12 @@ def _rig_rows(rig: BlendshapeRig) -> Rows:
     order = reach.argsort(descending=True)[:_MAX_NAMED].tolist()
     largest = ", ".join(f"{rig.names[row]} {float(reach[row]):.1f}" for row in order)
     rows = [*_mesh_rows(rig.neutral), ("shapes", _named(rig.names)), ("largest motions, mm", largest)]
+    apart = (rig.deltas - rig.deltas.mean(1, keepdim=True)).norm(dim=-1).amax(1)
+    shifts = [f"{rig.names[row]} ({float(reach[row]):.1f} mm)" for row in (apart < _ALIKE * reach).nonzero()[:, 0]]
+    if shifts:
+        rows.append(
+            ("warning", f"all vertices alike in {', '.join(shifts[:_MAX_NAMED])}: the head moves, not the face")
+        )
     flat = degenerate_triangles(rig.vertices, rig.neutral.faces)
     lost = {
         name: int((degenerate_triangles(rig.vertices + delta, rig.neutral.faces) & ~flat).sum())
