@@ -159,7 +159,7 @@ def make_folder(folder: str | Path) -> Path:
     return folder
 
 
-def check_ending(path: str | Path, *endings: str) -> None:
+def check_ending(path: str | Path, *endings: str, hint: str = "") -> None:
     """Refuses a file whose name does not end as what is written into it.
 
     Example:
@@ -171,7 +171,7 @@ def check_ending(path: str | Path, *endings: str) -> None:
     """
     suffix = Path(path).suffix
     if suffix.lower() not in endings:
-        raise FileFormatError(f"{path}: found the ending {suffix!r}, expected {', '.join(endings)}")
+        raise FileFormatError(f"{path}: found the ending {suffix!r}, expected {', '.join(endings)}{hint}")
 
 
 def check_writable(*files: Path | None, folder: Path | None = None) -> None:
