@@ -202,7 +202,8 @@ def test_the_first_start_solves_by_pytorch_until_its_graph_is_made(
     monkeypatch.setattr(live_anybody, "webcam_module", lambda: "module")
     monkeypatch.setattr(live_anybody, "ModuleSession", CountingSession)
     monkeypatch.setattr(live_anybody, "WebcamSession", CountingSession)
-    solver, picture = live_anybody.person_solver(silent), np.zeros((64, 64, 3), np.uint8)
+    said: list[str] = []
+    solver, picture = live_anybody.person_solver(lambda step, *_: said.append(step)), np.zeros((64, 64, 3), np.uint8)
     frames = [solver.step(picture, None, WebcamControls())]
     assert frames[0].calibrated == 0
     assert solver.reader.startswith("the graph was not ready by the last frame")
@@ -212,6 +213,7 @@ def test_the_first_start_solves_by_pytorch_until_its_graph_is_made(
         frames.append(solver.step(picture, 0.01, WebcamControls()))
     assert frames[-1].calibrated == 1
     assert solver.reader.startswith("the graph is made")
+    assert not [step for step in said if "is made" in step]  # which it was not yet
     assert [float(frame.weights[0]) for frame in frames] == list(range(1, len(frames) + 1))  # nothing is begun anew
     begun = live_anybody.person_solver(silent)  # the second start
     assert begun.reader == ""

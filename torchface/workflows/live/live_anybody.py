@@ -106,7 +106,7 @@ def person_solver(progress: Progress) -> PersonSolver:
     """
     if (graph := kept_webcam_graph()) is not None:
         return PersonSolver(WebcamSession(graph))
-    progress("reading faces by PyTorch while the graph is made, once")
+    progress("reading faces by PyTorch until the quicker graph is there, once")
     return PersonSolver(ModuleSession(webcam_module()), _SessionBeingMade().take)
 
 
