@@ -119,6 +119,23 @@ MISTAKES: dict[str, tuple[Callable[[Given], Any], str]] = {
     "flat samples": (lambda g: MorphableModel.fit(g.heads[..., 0]), r"samples: found \(4, \d+\), expected floats"),
     "samples for a model": (lambda g: HeadModel(g.heads, None, g.f), "shape: found a tensor .* a MorphableModel"),
     "too many coefficients": (lambda g: g.model(torch.zeros(1, 9)), r"coefficients: found \(1, 9\), expected \(B,3\)"),
+    "two and a half components": (
+        lambda g: MorphableModel.fit(g.heads, 2.5),
+        "components of 4 samples: found 2.5, exp",
+    ),
+    "a count of floats": (lambda g: g.model.truncate(2.0), r"count: found 2\.0, expected a whole number fr"),
+    "a share as a text": (lambda g: g.model.truncate(variance="0.9"), "variance: found '0.9', expected a finite numb"),
+    "vertices by floats": (
+        lambda g: g.model.project(g.heads[:, :2], vertices=[0.0, 1.0]),
+        "vertices: found floats, expected whole numbers",
+    ),
+    "a vertex of another head": (lambda g: g.model.part([0, 999]), "vertices: found indices 0 to 999, expected 0 to"),
+    "samples by the half": (lambda g: g.model.sample(1.5), "count: found 1.5, expected a whole number"),
+    "steps by the half": (lambda g: g.model.interpolate([0.0] * 3, [1.0] * 3, 2.5), "steps: found 2.5, expected a wh"),
+    "vertices for pairs": (
+        lambda g: align_scan(g.mesh, g.mesh, (["chin"], g.v[:1])),
+        "correspondences: found a list of str, expected a tensor",
+    ),
     "a mesh for neutrals": (lambda g: g.regression(g.mesh), r"neutrals: found a Mesh, expected a tensor"),
     "one neutral": (lambda g: g.regression(g.v), r"neutrals: found \(\d+, 3\), expected \(B,\d+,3\)"),
     "a face for a rig": (lambda g: transfer_deformation(g.mesh, g.rig), "source: found a Mesh, expected a Blendshape"),
@@ -206,7 +223,19 @@ def test_arrays_and_lists_give_what_tensors_give(given: Given) -> None:
     assert simplex_qp(H.tolist(), q.tolist()).dtype == torch.float32
     model = MorphableModel.fit(g.heads.numpy())
     torch.testing.assert_close(model(np.ones((1, 3))), g.model(torch.ones(1, 3)))
+    assert torch.equal(
+        g.model.project(g.heads[:, 2:5], [2, 3, 4]), g.model.project(g.heads[:, 2:5], torch.arange(2, 5))
+    )
+    assert torch.equal(g.model.log_prob([[1.0, 2.0, 0.0]]), torch.tensor([-2.5]))
     torch.testing.assert_close(g.regression(g.v[None].numpy()), g.regression(g.v[None]))
+
+
+def test_meshes_that_require_gradients_are_aligned_as_others(given: Given) -> None:
+    head, ids = given.mesh, torch.arange(0, 600, 40)
+    learned = head.with_vertices(head.vertices.clone().requires_grad_())
+    expected = align_scan(head, head, (ids, head.vertices[ids] + 3.0)).similarity
+    found = align_scan(learned, learned, (ids, learned.vertices[ids] + 3.0)).similarity
+    assert torch.equal(found.translation, expected.translation)
 
 
 def test_a_type_error_is_one_of_pythons_too(given: Given) -> None:

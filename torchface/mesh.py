@@ -12,7 +12,7 @@ from torch import Tensor
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.trimesh_conversion import from_trimesh, to_trimesh
-from torchface.number_checks import as_real, as_tensor, checked_type
+from torchface.number_checks import as_real, as_tensor, checked_indices, checked_type
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -125,13 +125,13 @@ class Mesh:
         if not torch.isfinite(self.vertices).all():
             bad = int((~torch.isfinite(self.vertices)).any(-1).sum())
             raise ValueRangeError(f"mesh: {bad} of {len(self.vertices)} vertices are NaN or infinite; expected none")
-        _check_indices("faces", self.faces, len(self.vertices))
+        checked_indices("faces", self.faces, len(self.vertices))
         if (self.uvs is None) != (self.uv_faces is None):
             raise TopologyError("mesh: uvs and uv_faces come together; found only one of them")
         if self.uvs is not None and self.uv_faces is not None:
             _check_shape("uvs", self.uvs, (None, 2))
             _check_shape("uv_faces", self.uv_faces, (len(self.faces), 3))
-            _check_indices("uv_faces", self.uv_faces, len(self.uvs))
+            checked_indices("uv_faces", self.uv_faces, len(self.uvs))
         if self.colors is not None:
             _check_shape("colors", self.colors, (len(self.vertices), 3))
         if self.texture is not None:
@@ -268,7 +268,7 @@ def submesh(mesh: Mesh, keep: Tensor) -> Submesh:
     if keep.dtype == torch.bool:
         _check_shape("keep", keep, (count,))
     else:
-        _check_indices("keep", keep, count)
+        checked_indices("keep", keep, count)
     mask = torch.zeros(count, dtype=torch.bool, device=device)
     mask[keep] = True
     ids = mask.nonzero()[:, 0]
@@ -325,24 +325,15 @@ def _check_shape(name: str, tensor: Tensor, expected: tuple[int | None, ...]) ->
         raise ShapeError(f"{name}: found {sizes}, expected ({wanted})")
 
 
-def _check_indices(name: str, indices: Tensor, count: int) -> None:
-    if indices.dtype != torch.int64:
-        raise TopologyError(f"{name}: found {indices.dtype}, expected torch.int64")
-    if indices.numel() and (int(indices.min()) < 0 or int(indices.max()) >= count):
-        raise TopologyError(
-            f"{name}: found indices {int(indices.min())} to {int(indices.max())}, expected 0 to {count - 1}"
-        )
-
-
 def _check_annotations(annotations: Annotations, count: int) -> None:
     if annotations.landmarks is not None:
         _check_shape("landmarks", annotations.landmarks, (None,))
-        _check_indices("landmarks", annotations.landmarks, count)
+        checked_indices("landmarks", annotations.landmarks, count)
     if annotations.mirror is not None:
         _check_shape("mirror", annotations.mirror, (count,))
-        _check_indices("mirror", annotations.mirror, count)
+        checked_indices("mirror", annotations.mirror, count)
     if annotations.contacts is not None:
         _check_shape("contacts", annotations.contacts, (None, 2))
-        _check_indices("contacts", annotations.contacts, count)
+        checked_indices("contacts", annotations.contacts, count)
     for name, mask in annotations.regions.items():
         _check_shape(f"regions[{name!r}]", mask, (count,))

@@ -8,7 +8,7 @@ from typing import TypeVar
 import numpy as np
 import torch
 
-from torchface.errors import ArgumentTypeError, FileFormatError, TorchfaceError, ValueRangeError
+from torchface.errors import ArgumentTypeError, FileFormatError, TopologyError, TorchfaceError, ValueRangeError
 
 Kind = TypeVar("Kind")
 
@@ -48,7 +48,8 @@ def checked_count(
     """The whole number itself, where it is in its range; as :func:`checked_number`, but 3.0 is no whole number."""
     fraction = isinstance(value, float) or (isinstance(value, torch.Tensor) and value.is_floating_point())
     if fraction or not least <= _real(value) <= most:
-        raise error(f"{name}: found {_shown(value)}, expected {_range_text('a whole number', least, most)}")
+        found = f"{_real(value):.1f}" if fraction and _real(value).is_integer() else _shown(value)
+        raise error(f"{name}: found {found}, expected {_range_text('a whole number', least, most)}")
     return int(_real(value))
 
 
@@ -77,6 +78,18 @@ def as_tensor(name: str, value: object, expected: str, dtype: torch.dtype | None
     if dtype is not None and not dtype.is_floating_point and made.is_floating_point():
         raise ArgumentTypeError(f"{name}: found floats, expected whole numbers {expected}")
     return made if dtype is None else made.to(dtype)
+
+
+def checked_indices(name: str, value: object, count: int) -> torch.Tensor:
+    """The tensor itself, or one of a list or an array, where it is of whole numbers from 0 to below ``count``."""
+    indices = as_tensor(name, value, "of whole numbers", torch.int64)
+    if indices.dtype != torch.int64:
+        raise TopologyError(f"{name}: found {indices.dtype}, expected torch.int64")
+    if indices.numel() and (int(indices.min()) < 0 or int(indices.max()) >= count):
+        raise TopologyError(
+            f"{name}: found indices {int(indices.min())} to {int(indices.max())}, expected 0 to {count - 1}"
+        )
+    return indices
 
 
 _READ_BY = {

@@ -151,7 +151,7 @@ def test_truncation_keeps_what_it_says(samples: torch.Tensor, model: MorphableMo
     assert model.truncate(variance=1.0).count == 13
     with pytest.raises(ValueRangeError, match=r"found 0.99.*at most 0\.9"):
         part.truncate(variance=0.9999)
-    with pytest.raises(ValueRangeError, match="found 14, expected 1 to 13"):
+    with pytest.raises(ValueRangeError, match="found 14, expected a whole number from 1 to 13"):
         model.truncate(14)
 
 
@@ -188,7 +188,7 @@ def test_samples_that_teach_nothing_are_refused(samples: torch.Tensor) -> None:
         MorphableModel.fit(samples[:1])
     with pytest.raises(ValueRangeError, match="found 3 that are all the same"):
         MorphableModel.fit(samples[:1].expand(3, -1, -1))
-    with pytest.raises(ValueRangeError, match="found 14, expected 1 to 13 with 14 samples"):
+    with pytest.raises(ValueRangeError, match="of 14 samples: found 14, expected a whole number from 1 to 13"):
         MorphableModel.fit(samples, 14)
     with pytest.raises(ValueRangeError, match=r"found 5, expected at most 3.*duplicates"):
         MorphableModel.fit(torch.cat([samples[:4], samples[:4]]), 5)

@@ -112,7 +112,7 @@ def test_a_killed_fit_gives_the_same_and_never_takes_the_rows_of_others(
 def test_samples_that_teach_nothing_are_refused(values: torch.Tensor) -> None:
     with pytest.raises(ShapeError, match="found 1, expected at least two"):
         MorphableModel.fit(InMemory(values[:1]), 1)
-    with pytest.raises(ValueRangeError, match="found 90, expected 1 to 89"):
+    with pytest.raises(ValueRangeError, match="found 90, expected a whole number from 1 to 89"):
         MorphableModel.fit(InMemory(values), 90)
     with pytest.raises(ValueRangeError, match="all the same"):
         MorphableModel.fit(InMemory(values[:1].expand(40, -1, -1)), 5)

@@ -11,7 +11,7 @@ from torchface.geometry.meshes.rigid_icp import Samples, ScanPoints, even_rotati
 from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
-from torchface.number_checks import checked_type
+from torchface.number_checks import as_tensor, checked_indices, checked_type
 from torchface.registration.scan_preparation import check_same_hand
 
 Correspondences = tuple[Tensor, Tensor]
@@ -74,6 +74,7 @@ def align_scan(
     """
     for name, one in (("mesh", mesh), ("scan", scan)):
         checked_type(name, one, Mesh)
+    mesh, scan = (one.with_vertices(one.vertices.detach()) for one in (mesh, scan))
     check_unit(
         "scan",
         scan.vertices[scan.faces.flatten()],
@@ -96,14 +97,9 @@ def align_scan(
 
 
 def _picked(mesh: Mesh, correspondences: Correspondences) -> tuple[Tensor, Tensor]:
-    on_mesh, on_scan = correspondences
-    if on_mesh.ndim == 1 and on_mesh.dtype == torch.int64:
-        if len(on_mesh) and not 0 <= int(on_mesh.min()) <= int(on_mesh.max()) < len(mesh.vertices):
-            raise ValueRangeError(
-                f"correspondences: found mesh vertices {int(on_mesh.min())} to {int(on_mesh.max())}, "
-                f"expected 0 to {len(mesh.vertices) - 1}"
-            )
-        on_mesh = mesh.vertices[on_mesh]
+    on_mesh, on_scan = (as_tensor("correspondences", one, "(L,) or (L,3)").detach() for one in correspondences)
+    if on_mesh.ndim == 1:
+        on_mesh = mesh.vertices[checked_indices("correspondences", on_mesh, len(mesh.vertices))]
     shapes = f"{tuple(on_mesh.shape)} and {tuple(on_scan.shape)}"
     if on_mesh.shape != on_scan.shape or on_mesh.ndim != 2 or on_mesh.shape[1] != 3:
         raise ShapeError(f"correspondences: found {shapes}, expected vertex ids (L,) or points (L,3), and points (L,3)")

@@ -12,7 +12,7 @@ from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.geometry.sample_batches import Samples, SamplesInMemory
 from torchface.modeling.morphable.principal_components import principal_components
-from torchface.number_checks import as_real, as_tensor
+from torchface.number_checks import as_real, as_tensor, checked_count, checked_indices, checked_number
 from torchface.optim.full_precision import full_precision
 from torchface.progress import Progress
 
@@ -117,8 +117,8 @@ class MorphableModel(nn.Module):
         count, most = samples.shape[0], components
         if len(samples.shape) != 3 or (isinstance(samples, Tensor) and not samples.is_floating_point()):
             raise ShapeError(f"samples: found {tuple(samples.shape)}, expected floats (M,V,C)")
-        if components is not None and not 1 <= components < max(count, 2):
-            raise ValueRangeError(f"components: found {components}, expected 1 to {count - 1} with {count} samples")
+        if components is not None:
+            checked_count(f"components of {count} samples", components, 1, max(count - 1, 1))
         device = torch.device("cpu")
         if isinstance(samples, Tensor):
             device, samples, most = samples.device, SamplesInMemory(samples.detach().cpu()), most or count
@@ -158,8 +158,7 @@ class MorphableModel(nn.Module):
     @full_precision
     def forward(self, coefficients: Tensor) -> Tensor:
         """Coefficients (B,K) to samples (B,V,C)."""
-        self._check(coefficients)
-        coefficients = as_real(coefficients, "coefficients")
+        coefficients = self._checked(coefficients)
         scaled = coefficients * self.standard_deviations.to(coefficients)
         offset = scaled @ self.components.flatten(1).to(coefficients)
         return self.mean.to(coefficients) + offset.reshape(-1, *self.mean.shape)
@@ -184,17 +183,15 @@ class MorphableModel(nn.Module):
 
         Raises:
             ShapeError: the shapes differ from the above.
-            ValueRangeError: infinity, noise that is not positive, or vertex ids outside the model.
+            ValueRangeError: infinity, or noise that is not positive.
+            TopologyError: vertex ids outside the model.
 
         Source: thesis 3.2.4; Albrecht, Luethi, Vetter 2008 (posterior shape models).
         """
         samples = as_tensor("samples", samples, "(B,V,C)").to(self.mean)
         mean, components = self.mean, self.components
         if vertices is not None:
-            if vertices.ndim != 1 or (
-                len(vertices) and not 0 <= int(vertices.min()) <= int(vertices.max()) < len(mean)
-            ):
-                raise ValueRangeError(f"vertices: found {_span(vertices)}, expected ids (N,) from 0 to {len(mean) - 1}")
+            vertices = checked_indices("vertices", vertices, len(mean)).flatten()
             mean, components = mean[vertices], components[:, vertices]
         if samples.ndim != 3 or samples.shape[1:] != mean.shape:
             raise ShapeError(f"samples: found {tuple(samples.shape)}, expected (B,{mean.shape[0]},{mean.shape[1]})")
@@ -224,18 +221,17 @@ class MorphableModel(nn.Module):
     def log_prob(self, coefficients: Tensor) -> Tensor:
         r""":math:`-\frac12 \lVert a \rVert^2` of coefficients (B,K), (B,); the constant
         :math:`-\frac K2 \log 2\pi` is left out, so that the mean has 0."""
-        self._check(coefficients)
+        coefficients = self._checked(coefficients)
         return -0.5 * coefficients.square().sum(-1)
 
     def sample(self, count: int, generator: torch.Generator | None = None) -> Tensor:
         """Coefficients (count,K) drawn from the model; ``model(model.sample(3))`` are three samples."""
-        return torch.randn(count, self.count, generator=generator).to(self.mean)
+        return torch.randn(checked_count("count", count), self.count, generator=generator).to(self.mean)
 
     def interpolate(self, first: Tensor, second: Tensor, steps: int) -> Tensor:
         """Coefficients (steps,K) on the straight way from one (K,) to another, both included."""
-        self._check(torch.stack([first, second]))
-        if steps < 2:
-            raise ValueRangeError(f"steps: found {steps}, expected at least 2")
+        first, second = self._checked([first, second])
+        steps = checked_count("steps", steps, 2)
         return torch.lerp(first, second, torch.linspace(0, 1, steps, device=first.device, dtype=first.dtype)[:, None])
 
     def truncate(self, count: int | None = None, variance: float | None = None) -> "MorphableModel":
@@ -251,19 +247,19 @@ class MorphableModel(nn.Module):
         if (count is None) == (variance is None):
             raise ValueRangeError("truncate: expected either a count or a share of the variance")
         if variance is not None:
-            held = float(self.explained[-1])
             # What rounding to float32 leaves of a whole is still the whole.
-            if not 0 < variance <= 1 or variance > held + 1e-5:
-                raise ValueRangeError(f"variance: found {variance:g}, expected above 0 and at most {held:.4f}")
+            checked_number("variance", variance, 0.0, min(1.0, float(self.explained[-1]) + 1e-5), above=True)
             count = min(int((self.explained < variance - 1e-9).sum()) + 1, self.count)
-        if count is None or not 1 <= count <= self.count:
-            raise ValueRangeError(f"count: found {count}, expected 1 to {self.count}")
+        count = checked_count("count", count, 1, self.count)
         return MorphableModel(
             self.mean, self.components[:count], self.standard_deviations[:count], self.total_variance, self.samples
         )
 
     def part(self, vertices: Tensor) -> "MorphableModel":
-        """The same distribution seen at some vertices (N,) only; its components are orthonormal there."""
+        """The same distribution seen at some vertices only, ids (N,) or a mask (V,); its components are orthonormal
+        there."""
+        if getattr(vertices, "dtype", None) != torch.bool:
+            vertices = checked_indices("vertices", vertices, len(self.mean)).flatten()
         modes = self.modes[:, vertices].double().flatten(1)
         _, deviations, components = torch.linalg.svd(modes, full_matrices=False)
         kept = deviations > 1e-6 * deviations[0].clamp(min=1e-12)
@@ -296,13 +292,11 @@ class MorphableModel(nn.Module):
             values["samples"].whole(0, _MAX_BYTES - 1),
         )
 
-    def _check(self, coefficients: Tensor) -> None:
+    def _checked(self, coefficients: Tensor | list[Tensor]) -> Tensor:
+        coefficients = as_real(coefficients, "coefficients")  # type: ignore[arg-type]
         if coefficients.ndim != 2 or coefficients.shape[1] != self.count:
             raise ShapeError(f"coefficients: found {tuple(coefficients.shape)}, expected (B,{self.count})")
-
-
-def _span(ids: Tensor) -> str:
-    return f"{tuple(ids.shape)}" + (f", {int(ids.min())} to {int(ids.max())}" if len(ids) else "")
+        return coefficients
 
 
 def _precision(noise: float | Tensor | None, count: int) -> Tensor:
