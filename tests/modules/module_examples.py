@@ -33,8 +33,18 @@ from torchface.enhancement import CapturedPerformance, EnhancementModel
 from torchface.enhancement.wrinkle_maps.wrinkle_weights import WrinkleWeights
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.similarity import Similarity
-from torchface.landmarks import BoxNetwork, EyeNetwork, LandmarkNetwork, LandmarkTrees
+from torchface.landmarks import (
+    AppearanceModel,
+    AppearanceSettings,
+    BoxNetwork,
+    DetectorSettings,
+    EyeNetwork,
+    LandmarkNetwork,
+    LandmarkTrees,
+    UVLandmarkDetector,
+)
 from torchface.landmarks.images.networks.part_network import PartNetwork
+from torchface.landmarks.scans.hog import HogLayout
 from torchface.modeling import ExpressionRegression, ExpressionSettings, HeadModel, MorphableModel
 from torchface.onnx import SolverGraph
 from torchface.optim import BoxQP, FixedSplitting, ProjectedGradient
@@ -229,6 +239,34 @@ def landmark_trees(number: int) -> LandmarkTrees:
     return trees
 
 
+def faces_in_pictures(number: int) -> tuple[Tensor, Tensor]:
+    """Pictures (4,1,72,72) of one pattern, moved, and landmarks (4,68,2) that move with it, pixels."""
+    coarse = random(1, 1, 12, 12, seed=number)
+    pattern = torch.nn.functional.interpolate(coarse, size=(72, 72), mode="bicubic").clamp(0, 1).float()
+    points = seen_landmarks()[:1].float()
+    points = 10 + 50 * (points - points.amin(1)) / (points.amax(1) - points.amin(1)).max()
+    images = torch.cat([pattern.roll((step, step), (2, 3)) for step in range(4)])
+    return images, points + torch.arange(4.0)[:, None, None] + random(4, 68, 2, seed=7).float()
+
+
+@cache
+def appearance_model(number: int) -> AppearanceModel:
+    images, landmarks = faces_in_pictures(number)
+    return AppearanceModel.fit(list(images), landmarks, AppearanceSettings("grey", (8.0, 12.0), iterations=2))
+
+
+def appearance_inputs() -> tuple[Tensor, Tensor]:
+    images, landmarks = faces_in_pictures(0)
+    return images[:2], landmarks[:2] + 1.5
+
+
+@cache
+def uv_detector(number: int) -> UVLandmarkDetector:
+    settings = DetectorSettings(hog=HogLayout(stride=4), responses=20)
+    places = torch.tensor([[30.0, 32.0], [64.0, 60.0]]) + 4 * random(3, 2, 2, seed=number).float()
+    return UVLandmarkDetector.fit(random(3, 1, 96, 96, seed=number).float(), places, ("a", "b"), settings=settings)
+
+
 def action_unit_classifier(number: int) -> ActionUnitClassifier:
     groups = [RegionGroup("brows", ("left brow", "right brow"), ("1", "4"), ())]
     model = ActionUnitClassifier(groups, [GroupSize(3, 3)], 16)
@@ -350,6 +388,13 @@ EXAMPLES: dict[str, Example] = {
     "LandmarkTrees": Example(
         landmark_trees, lambda: (random(2, 1, 40, 40).float(), torch.tensor([[5.0, 5, 30, 30], [8, 6, 25, 28]])),
         cells={"gradients": "no", "jacrev": "no"},
+    ),
+    "AppearanceModel": Example(
+        appearance_model, appearance_inputs, cells={**SOLVER, "torch.export": "no"}
+    ),
+    "UVLandmarkDetector": Example(
+        uv_detector, lambda: (random(2, 1, 96, 96, seed=1).float(),),
+        cells={**SOLVER, "gradients": "no", "jacrev": "no", "torch.export": "no"},
     ),
     "LandmarkNetwork": Example(
         network(lambda: LandmarkNetwork(32, channels=(4, 4, 6, 8), blocks=(1, 1, 1), decoder=6, points=5, hidden=12)),

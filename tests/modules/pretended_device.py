@@ -29,7 +29,7 @@ class Elsewhere(torch.Tensor):
         # Sparse ones have no strides, and pass for dense ones.
         placed = (numbers.stride(), numbers.storage_offset()) if numbers.layout == torch.strided else ()
         made = torch.Tensor._make_wrapper_subclass(cls, numbers.shape, *placed, dtype=numbers.dtype, device="meta")
-        made.numbers = numbers
+        made.numbers = numbers.resolve_conj()  # whose lazy kind the wrapper would not show
         return made
 
     @classmethod

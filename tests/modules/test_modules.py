@@ -83,7 +83,7 @@ def test_calls_leave_no_tensors_behind(name: str) -> None:
 
 
 # Pictures are shares of white, of which integers are 0 and 1 alone.
-NO_INTEGERS = ("ActionUnitClassifier", "LandmarkTrees", "LandmarkNetwork", "EyeNetwork")
+NO_INTEGERS = ("ActionUnitClassifier", "AppearanceModel", "LandmarkTrees", "LandmarkNetwork", "EyeNetwork")
 
 
 @every_class

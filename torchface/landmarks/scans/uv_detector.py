@@ -16,6 +16,7 @@ from torchface.landmarks.scans.line_shape import REACH, STATIONS, LineShape
 from torchface.landmarks.scans.score_statistics import best_scores, score_statistics
 from torchface.landmarks.scans.uv_landmark_names import LINES, UV_LANDMARK_NAMES
 from torchface.mesh import Mesh
+from torchface.optim.data_dependent import data_dependent
 from torchface.optim.mean_shift import mean_shift
 from torchface.rendering.gaussian_blur import unsharp
 
@@ -199,6 +200,7 @@ class UVLandmarkDetector(nn.Module):
             self._fit_lines(lines.lines, images if lines.images is None else lines.images)
         return self
 
+    @data_dependent("to keep the detector, which finds a scan's landmarks once")
     def forward(self, images: Tensor) -> UVLandmarks:
         """Landmarks of images (B,C,S,S) in [0,1].
 

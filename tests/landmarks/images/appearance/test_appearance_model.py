@@ -334,6 +334,18 @@ def test_a_face_that_is_lost_stays_lost(film: PortraitVideo, model: AppearanceMo
     assert nothing.landmarks.isnan().all()
 
 
+def test_pictures_of_any_precision_are_taken_and_integers_are_refused(
+    film: PortraitVideo, model: AppearanceModel
+) -> None:
+    shown, start = images(film)[:1], half_neutral(film)[:1]
+    wanted = model(shown, start)
+    torch.testing.assert_close(model(shown.double(), start), wanted)
+    torch.testing.assert_close(model.error(shown.double(), start), model.error(shown, start))
+    torch.testing.assert_close(model(shown.half(), start), wanted, rtol=0, atol=0.05)
+    with pytest.raises(ShapeError, match=r"images: found torch.uint8, expected floats in \[0,1\]"):
+        model((255 * shown).byte(), start)
+
+
 def test_bad_input_is_refused_by_name(film: PortraitVideo, model: AppearanceModel) -> None:
     frames, points = list(film.frames[:4]), film.landmarks[:4]
     with pytest.raises(ShapeError, match="found 2, expected at least 3"):

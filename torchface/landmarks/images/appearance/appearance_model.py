@@ -15,6 +15,9 @@ from torchface.landmarks.images.appearance.dense_features import CHANNELS, Featu
 from torchface.landmarks.images.appearance.face_warp import with_forehead
 from torchface.landmarks.images.appearance.shape_modes import PlanarPose, planar_pose
 from torchface.landmarks.images.ibug_68 import COUNT
+from torchface.number_checks import as_real
+from torchface.optim.data_dependent import data_dependent
+from torchface.optim.full_precision import full_precision
 from torchface.optim.prepared_tensors import Prepared
 from torchface.progress import Progress, silent
 
@@ -238,11 +241,15 @@ class AppearanceModel(nn.Module):
         Raises:
             ShapeError: images or initial guess of another shape.
         """
-        grey = grey_images(images)
+        grey, initial = self._grey(images), as_real(initial, "initial")
         if initial.shape != (len(grey), COUNT, 2):
             raise ShapeError(f"initial: found {tuple(initial.shape)}, expected {(len(grey), COUNT, 2)}")
+        return self._refined(grey, initial)
+
+    @data_dependent("to keep the model and export what finds its initial guess")
+    def _refined(self, grey: Tensor, initial: Tensor) -> AppearanceFit:
         refined = torch.full_like(initial, torch.nan)
-        before, after = initial.new_full((2, len(initial)), torch.inf)
+        before, after = (initial.new_full((len(initial),), torch.inf) for _ in range(2))
         usable = torch.isfinite(initial).flatten(1).all(1) & (initial.flatten(1).std(1) > 0)
         if usable.any():
             crops, points = grey[usable], initial[usable].to(self.mean_shape)
@@ -256,10 +263,11 @@ class AppearanceModel(nn.Module):
             refined[usable] = points.to(initial)
         return AppearanceFit(refined, after, before)
 
+    @full_precision
     def error(self, images: Tensor, landmarks: Tensor) -> Tensor:
         """How badly faces at these landmarks (B,68,2) look like the person, (B,), at the finest resolution."""
         points = landmarks.to(self.mean_shape)
-        return self._error_in(self.crop(grey_images(images), points, float(self.levels[-1].scale)), points)
+        return self._error_in(self.crop(self._grey(images), points, float(self.levels[-1].scale)), points)
 
     def crop(self, images: Tensor, landmarks: Tensor, resolution: float) -> FaceCrop:
         """Upright images of faces, ``resolution`` pixels a unit of the mean shape, as features.
@@ -283,6 +291,11 @@ class AppearanceModel(nn.Module):
             some = PlanarPose(pose.rotation[rows], pose.translation[rows])
             crops[rows] = _cut_out(images[rows], some, (width, height), count)
         return FaceCrop(dense_features(crops, self.settings.features), pose)
+
+    def _grey(self, images: Tensor) -> Tensor:
+        if not images.is_floating_point():
+            raise ShapeError(f"images: found {images.dtype}, expected floats in [0,1]")
+        return grey_images(images.to(self.mean_shape))
 
     def _error_in(self, crop: FaceCrop, landmarks: Tensor) -> Tensor:
         level = self.levels[-1]
