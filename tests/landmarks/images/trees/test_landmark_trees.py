@@ -258,6 +258,9 @@ def test_bad_input_is_named(learned: LandmarkTrees) -> None:
         LandmarkTrees.fit(images, boxes * torch.tensor([[1.0], [1], [-1]]), points, FEW)
     with pytest.raises(ValueRangeError, match="landmark 0: found in no image"):
         LandmarkTrees.fit(images, boxes, points * torch.nan, FEW)
+    for same in (points[:, :1], points[:, :1].expand(-1, 3, -1)):
+        with pytest.raises(ValueRangeError, match="landmarks: found a single place, expected at least two"):
+            LandmarkTrees.fit(images, boxes, same, FEW)
     for name, value in (("trees", 0), ("depth", 40), ("noise", -0.1), ("shrinkage", 2.0)):
         with pytest.raises(ValueRangeError, match=f"{name}: found {value}|found {name} {value}"):
             TreeSettings(**{name: value})

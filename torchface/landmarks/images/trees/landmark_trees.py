@@ -148,7 +148,7 @@ class LandmarkTrees(nn.Module):
                     f"{name}: found {int(values.min())} to {int(values.max())}, expected below {limit}"
                 )
         if not float((self.mean - self.mean.mean(0)).abs().max()) > 0:
-            raise ValueRangeError("mean: found a single point, expected a shape")
+            raise ValueRangeError("landmarks: found a single place, expected at least two")
 
     def forward(self, images: Tensor, boxes: Tensor) -> Tensor:
         """Landmarks (B,L,2), pixels.

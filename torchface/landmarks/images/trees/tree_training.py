@@ -124,6 +124,7 @@ def fit_trees(
     generator = torch.Generator().manual_seed(settings.seed)
     samples, initial, mean = _draw_initial_shapes(images, boxes, landmarks, settings, mirror, generator)
     model.mean.copy_(mean)
+    model.check_state()
     key, done, shapes = "", 0, initial
     if checkpoint is not None:
         key = content_key(_METHOD, images=images, boxes=boxes, landmarks=landmarks, settings=settings, mirror=mirror)
