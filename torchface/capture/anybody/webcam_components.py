@@ -1,6 +1,8 @@
 """Settings of the webcam's solver, and its components: what follows from the rig, people, the prior and names."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Self
 
 import torch
 from torch import Tensor, nn
@@ -167,6 +169,15 @@ class WebcamSolverParts(nn.Module):
             # What no rig, person or prior brings is in no state.
             kept = name not in _CONSTANTS
             self.register_buffer(name, value.double() if value.is_floating_point() else value, persistent=kept)
+
+    def _apply(self, fn: Callable[[Tensor], Tensor], recurse: bool = True) -> Self:
+        """Moves to a device; numbers stay double, as they are computed with, where the rest of a network does not."""
+
+        def moved(x: Tensor) -> Tensor:
+            made = fn(x)
+            return made if made.dtype == x.dtype else x.to(made.device)
+
+        return super()._apply(moved, recurse)  # type: ignore[no-untyped-call, no-any-return]
 
     def start(self) -> WebcamState:
         """The state before the first frame, all zeros."""
