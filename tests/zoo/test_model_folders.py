@@ -13,7 +13,7 @@ import torch
 
 from tests.zoo.conftest import CARD, morphable, noise
 from torchface import TorchfaceError, zoo
-from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.errors import ArgumentTypeError, FileFormatError, NameMismatchError, ValueRangeError
 from torchface.modeling.morphable.morphable_model import MorphableModel
 
 REPOSITORY = Path(__file__).resolve().parents[2]
@@ -44,6 +44,17 @@ def test_half_precision_where_it_is_asked_for(tmp_path: Path) -> None:
     assert torch.equal(again.mean, model.mean)
     with pytest.raises(ValueRangeError, match="found modes"):
         zoo.save_model(model, tmp_path / "none", CARD, half=["modes"])
+
+
+def test_a_card_holds_what_its_file_can(tmp_path: Path) -> None:
+    settings = {"data": tmp_path, "folders": [Path("a")], "scale": 2.0}
+    zoo.save_model(morphable(), tmp_path / "mine", replace(CARD, settings=settings))
+    assert zoo.describe(str(tmp_path / "mine")).settings == {"data": str(tmp_path), "folders": ["a"], "scale": 2.0}
+    with pytest.raises(ArgumentTypeError, match="expected texts and numbers"):
+        zoo.save_model(morphable(), tmp_path / "other", replace(CARD, settings={"rates": {1, 2}}))
+    with pytest.raises(ArgumentTypeError, match=r"card\.licence: found an int, expected a str"):
+        zoo.save_model(morphable(), tmp_path / "other", replace(CARD, licence=1))
+    assert [path.name for path in tmp_path.iterdir()] == ["mine"]
 
 
 def test_the_description_is_what_was_said(home: Path) -> None:

@@ -15,7 +15,7 @@ import tomli_w
 import torch
 from torch import Tensor
 
-from torchface.errors import FileFormatError
+from torchface.errors import ArgumentTypeError, FileFormatError
 from torchface.files.whole_files import read_file, write_file
 
 _MAX_BYTES = 2**20
@@ -192,8 +192,12 @@ def write_json(path: str | Path, document: Mapping[str, Any], indent: int | None
 
 
 def write_toml(path: str | Path, document: Mapping[str, Any]) -> None:
-    """Writes a TOML file that appears only when it is complete; what is None is left out."""
-    write_file(path, tomli_w.dumps(_without_none(document)).encode())
+    """Writes a TOML file that appears only when it is complete; what is None is left out, paths become texts."""
+    try:
+        text = tomli_w.dumps(_without_none(document))
+    except TypeError as error:
+        raise ArgumentTypeError(f"{path}: found what TOML cannot hold ({error}), expected texts and numbers") from error
+    write_file(path, text.encode())
 
 
 def _read(path: str | Path, parse: Callable[[bytes], Any], kind: str, marker: str | None, max_bytes: int) -> Value:
@@ -212,7 +216,9 @@ def _read(path: str | Path, parse: Callable[[bytes], Any], kind: str, marker: st
 def _without_none(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {key: _without_none(inner) for key, inner in value.items() if inner is not None}
-    return [_without_none(inner) for inner in value] if isinstance(value, list | tuple) else value
+    if isinstance(value, list | tuple):
+        return [_without_none(inner) for inner in value]
+    return str(value) if isinstance(value, Path) else value
 
 
 def _without_nan(value: Any) -> Any:

@@ -10,6 +10,7 @@ from torch import nn
 from torchface.errors import NameMismatchError
 from torchface.files.model_roots import check_model_name
 from torchface.files.models import ModelRecord, write_model
+from torchface.number_checks import checked_type
 from torchface.zoo.kinds import KINDS
 
 
@@ -57,6 +58,7 @@ def save_model(model: nn.Module, folder: str | Path, card: ModelCard, half: Coll
         NameMismatchError: the model's class has no kind, or the folder's name is none for a model.
         FileFormatError: the folder cannot be written to.
         ValueRangeError: the state or a metric is not finite.
+        ArgumentTypeError: the card holds something else than texts, numbers, paths, and lists and tables of them.
 
     Example:
         >>> from torchface import zoo
@@ -69,6 +71,9 @@ def save_model(model: nn.Module, folder: str | Path, card: ModelCard, half: Coll
     if not kinds:
         known = ", ".join(model_class.__name__ for model_class in KINDS.values())
         raise NameMismatchError(f"save_model: found a {type(model).__name__}, expected one of {known}")
+    checked_type("card", card, ModelCard)
+    for name in ("licence", "data", "recipe", "text", "url"):
+        checked_type(f"card.{name}", getattr(card, name), str)
     folder = Path(folder)
     check_model_name(folder)
     record = ModelRecord(
