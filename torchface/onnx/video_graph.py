@@ -148,7 +148,7 @@ class VideoGraph(nn.Module):
         before = torch.where(first, 0.0, state["hidden"])[None] if self.walks else torch.zeros_like(evidence)
         hidden = unseen_time(before, evidence, interval)
         if self.walks:
-            mean, information = self._walked(head, evidence, hidden, first)
+            mean, information = self._walked(head, evidence, hidden, before.amin(), first)
         else:
             mean, information = self._expected(head, window, first, state)
         noise = self.step.solver.noise(head.rotation, head.translation)
@@ -204,9 +204,15 @@ class VideoGraph(nn.Module):
         rays = torch.nn.functional.pad(pixels, (0, 1), value=1.0) @ self.to_rays
         return affine_pose(self.step.solver.rest[:LANDMARKS], rays[:, :2] / rays[:, 2:], trust)
 
-    def _walked(self, head: HeadState, evidence: Tensor, hidden: Tensor, first: Tensor) -> tuple[HeadState, Tensor]:
-        """The prediction for this frame from the last one's weights: the mean and its information (N+6,N+6)."""
-        walked = self.step.solver.walked(head, evidence, hidden, self.settings.interval)
+    def _walked(
+        self, head: HeadState, evidence: Tensor, hidden: Tensor, lost: Tensor, first: Tensor
+    ) -> tuple[HeadState, Tensor]:
+        """The prediction for this frame from the last one's weights and pose: the mean and its information (N+6,N+6).
+
+        A face that was ``lost`` for so many seconds, (), may be further away.
+        """
+        interval = self.settings.interval
+        walked = self.step.solver.walked(head, evidence, hidden, interval, interval + lost)
         weights = torch.where(first, 0.0, walked.mean.weights)
         return (
             HeadState(weights, head.rotation, head.translation),

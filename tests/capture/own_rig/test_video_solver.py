@@ -11,7 +11,7 @@ from torch import Tensor
 from planted.gaussian_density import gaussian
 from torchface import BlendshapeRig, Corrective, Correctives
 from torchface.capture import DynamicsPrior, ShapePrior, VideoSolver
-from torchface.capture.own_rig import VideoSettings, solve_whole_take
+from torchface.capture.own_rig import FaceMeasurements, VideoSettings, solve_whole_take
 from torchface.capture.own_rig.face_points import FacePoints
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
@@ -265,6 +265,19 @@ def test_antagonists_change_sides_during_a_take() -> None:
     left, right = (solved[:, rig.names.index(name)] for name in ("mouthLeft", "mouthRight"))
     assert float(torch.minimum(left, right).max()) == 0
     assert float((left - right - at).abs().max()) < 0.12
+
+
+def test_a_head_does_not_jump_where_half_of_its_landmarks_are_hidden(small: BlendshapeRig) -> None:
+    """A hand before nose, mouth and chin leaves brows and eyes, from which a far head's distance is hardly seen."""
+    rotation, translation = (x.expand(12, *x.shape[1:]) for x in poses(1, 1300.0))
+    found = film(small, acted(1).expand(12, -1), rotation, translation, noise=0.4)
+    hidden = [*range(4, 17), *range(27, 36), *range(48, 68)]
+    found[6] = 11 * found[6] - 10 * found[5]  # of all of a face behind a hand networks are less sure
+    sure, off = torch.ones(12, 68), torch.full((12, 68), 0.4)
+    sure[6, hidden], off[6] = 0.02, 4.0
+    solver = VideoSolver(small, None, K, settings=VideoSettings.of_found_landmarks())
+    moved = solver(found, confidence=sure, measured=FaceMeasurements(off)).translation
+    assert float(moved.diff(dim=0).norm(dim=1).max()) < 25
 
 
 def test_landmarks_that_are_not_trusted_are_no_face(small: BlendshapeRig) -> None:

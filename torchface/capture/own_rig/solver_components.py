@@ -26,6 +26,9 @@ from torchface.shape_names import read_as_arkit
 CONTOUR_WEIGHT = 0.5
 ROTATION_STEP, TRANSLATION_STEP = 0.02, 4.0
 """How far a head moves from frame to frame: standard deviations in radians and millimetres."""
+_TURN, _SHIFT = 0.6, 120.0
+"""How far it wanders in a second, where weights walk: landmarks that are left while others are hidden lead no further
+astray."""
 INITIAL_ROTATION, INITIAL_TRANSLATION = 0.5, 500.0
 """Standard deviations of a pose before any landmark is seen, radians and millimetres."""
 INITIAL_WEIGHT, DEFAULT_WEIGHT_STEP = 1.0, 0.1
@@ -117,11 +120,13 @@ class VideoSolverParts(nn.Module):
         count = len(names)
         # Nothing is expected of weights that no dynamics prior leads to, next to nothing of a first frame's.
         weight = 0.0 if dynamics is None else INITIAL_WEIGHT**-2
+        # From frame to frame with a dynamics prior, in a second without.
+        turn, shift = (_TURN, _SHIFT) if dynamics is None else (ROTATION_STEP, TRANSLATION_STEP)
         lids = [_LIDS.match(name) for name in read_as_arkit(names)]
         constants = {
             "lower": [0.0] * count + [-torch.inf] * 6,
             "upper": [1.0] * count + [torch.inf] * 6,
-            "motion_variance": [ROTATION_STEP**2] * 3 + [TRANSLATION_STEP**2] * 3,
+            "motion_variance": [turn**2] * 3 + [shift**2] * 3,
             "initial_information": [weight] * count + [INITIAL_ROTATION**-2] * 3 + [INITIAL_TRANSLATION**-2] * 3,
             "l1_penalty": [settings.sparsity] * count + [0.0] * 6,
             "ridge": [2 * settings.ridge] * count + [0.0] * 6,

@@ -34,7 +34,8 @@ class VideoSettings:
         contour_slide: how much an error along the contour counts beside one across it, 0 to 1. At 1 contour landmarks
             are the vertices themselves.
         motion: how far a weight wanders in a second, standard deviation; lids go further. Without a dynamics prior each
-            frame's weights are then a step of that random walk from the last frame's. 0 solves frames apart.
+            frame's weights, and the head with them, are then a step of that random walk from the last frame's. 0 solves
+            frames apart.
         interval: seconds from frame to frame where none are given.
         tolerance: a frame's steps end when no weight moves further than this.
         steps: of Gauss and Newton that a frame takes at most.

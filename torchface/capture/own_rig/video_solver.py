@@ -282,18 +282,24 @@ class VideoSolver(FrameSolver):
         if state.head is None or not self.walks:
             mean = HeadState(rotation.new_zeros(1, len(self.names)), rotation, translation)
             return Expectation(mean, self.initial_information.double().diag()[None])
-        return self.walked(HeadState(state.head.weights, rotation, translation), evidence, hidden, interval)
+        head = HeadState(state.head.weights, rotation, translation)
+        # A pose that was tracked, or found in a frame by itself, is where the search starts and no more.
+        return self.walked(head, evidence, hidden, interval, interval if rotation is state.head.rotation else None)
 
-    def walked(self, head: HeadState, evidence: Tensor, hidden: Tensor, interval: float) -> Expectation:
-        """The prediction of a random walk of the weights (B,N) of the frame before; a pose is expected where it is.
+    def walked(
+        self, head: HeadState, evidence: Tensor, hidden: Tensor, interval: float, since: float | Tensor | None
+    ) -> Expectation:
+        """The prediction of a random walk of the weights (B,N) of the frame before, and of its pose.
 
         Args:
             head: weights of the frame before, and the pose.
             evidence, hidden: as of ``weight_walk``, (B,N).
             interval: seconds since the frame before.
+            since: seconds since the head was seen in the pose; None where it was not.
         """
         weights = walk_information(self.walk_variance.double(), evidence, interval)
-        motion = self.initial_information.double()[-6:].expand(len(weights), 6)
+        motion = self.initial_information.double()[-6:]
+        motion = (motion if since is None else 1 / (self.motion_variance.double() * since)).expand(len(weights), 6)
         mean = expected_weights(head.weights, evidence, hidden, interval, self.twins)
         expected = HeadState(mean, head.rotation, head.translation)
         return Expectation(expected, torch.diag_embed(torch.cat([weights, motion], dim=1)))
