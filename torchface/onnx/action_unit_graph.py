@@ -55,8 +55,8 @@ def export_action_units(
     """Writes a classifier as ONNX, and checks it.
 
     The graph takes ``regions`` (B,R,h,w), patterns in [0,1], and ``rest`` (R,h,w), the same of the performer's face at
-    rest, and gives ``intensities`` (B,A). The metadata holds the names of regions and ``units`` (JSON) and the
-    ``version``.
+    rest, and gives ``intensities`` (B,A), NaN as the module's of what a pattern with NaN or infinity shows. Metadata
+    hold the names of regions and ``units`` (JSON) and the ``version``.
 
     Args:
         classifier: a trained one.

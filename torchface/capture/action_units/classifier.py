@@ -14,7 +14,6 @@ from torchface.capture.action_units.region_video import RegionVideo
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
 from torchface.io.action_labels import ActionLabels
-from torchface.optim.data_dependent import is_recorded, is_transformed
 from torchface.progress import Progress
 
 _MAX_COUNT = 4096
@@ -61,7 +60,8 @@ class GroupClassifier(nn.Module):
 
     def forward(self, images: Tensor, rest: Tensor) -> Tensor:
         """Intensities (B,A) of the group's units, for its regions (B,G,h,w) and those at rest (G,h,w)."""
-        return self.intensities[self.scores(images, rest).argmax(1)]
+        known = torch.isfinite(images).flatten(1).all(1, keepdim=True) & torch.isfinite(rest).all()
+        return torch.where(known, self.intensities[self.scores(images, rest).argmax(1)], torch.nan)
 
 
 @dataclass(frozen=True)
@@ -215,7 +215,7 @@ class ActionUnitClassifier(nn.Module):
         return [part for part in self.parts if isinstance(part, GroupClassifier)]
 
     def forward(self, regions: Tensor, rest: Tensor) -> Tensor:
-        """Intensities (B,A) in [0,1], in the order of ``units``.
+        """Intensities (B,A) in [0,1], in the order of ``units``; NaN of what a pattern with NaN or infinity shows.
 
         Args:
             regions: patterns (B,R,h,w) in [0,1], in the order of ``regions``, warped to ``neutral``; see
@@ -224,7 +224,6 @@ class ActionUnitClassifier(nn.Module):
 
         Raises:
             ShapeError: another shape.
-            ValueRangeError: NaN or infinity in a pattern.
         """
         parts = self.group_classifiers()
         own, still = self.split(regions), self.split(rest[None])
@@ -236,8 +235,6 @@ class ActionUnitClassifier(nn.Module):
             raise ShapeError(
                 f"regions: found {tuple(regions.shape)}, expected (B,{len(self.regions)},{self.size},{self.size})"
             )
-        if not (is_recorded() or is_transformed() or bool(torch.isfinite(regions).all())):
-            raise ValueRangeError("regions: found NaN or infinity, expected pictures in [0,1]")
         return [regions[:, [self.regions.index(name) for name in group.regions]] for group in self.groups]
 
 
