@@ -13,7 +13,7 @@ import torch
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from torchface import BlendshapeRig, save_rig, save_take, zoo
+from torchface import BlendshapeRig, save_mesh, save_rig, save_take, zoo
 from torchface.capture import ShapePrior
 from torchface.cli import main
 from torchface.cli.terminal import PlainConsole, plain_errors, print_path
@@ -292,6 +292,26 @@ def test_view_plays_takes_with_gaps_and_animated_rigs(
     main(["view", animated, animated, "--port", "0", "--out", out])
     assert [weights for weights, _ in shown] == [pytest.approx([0.25, 0.5, 0.75])] * 2
     assert [line[:29] for _, line in shown] == ["1 frames without a face take ", ""]
+
+
+def test_a_head_that_a_page_cannot_show_for_its_size_is_said(
+    dome_rig: BlendshapeRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    pytest.importorskip("viser")
+    for name in ("view", "pick"):
+        monkeypatch.setattr(sys.modules[f"torchface.cli.{name}"], "serve_page", lambda page, line="": page.stop())
+    small = BlendshapeRig(
+        dome_rig.neutral.with_vertices(dome_rig.vertices / 1e3), dome_rig.deltas / 1e3, dome_rig.names
+    )
+    rig, metres, head = tmp_path / "rig.glb", tmp_path / "metres.obj", tmp_path / "head.obj"
+    save_rig(small, rig)
+    save_mesh(small.neutral, metres)
+    save_mesh(dome_rig.neutral, head)
+    for words, name in (("view", rig), rig), (("pick", head, metres), f"{metres} (--scan-unit)"):
+        main([*map(str, words), "--port", "0"])
+        said = "".join(capsys.readouterr().err.split())
+        assert said.count("warning:") == 1
+        assert f"warning:{name}:0.".replace(" ", "") in said
 
 
 @pytest.mark.parametrize("words", ["export --help", "--version", "--help"])

@@ -7,7 +7,7 @@ from tyro.conf import Positional
 
 from torchface.cli.command_options import Output
 from torchface.cli.progress_bars import progress_bars
-from torchface.cli.terminal import Quiet, serve_page
+from torchface.cli.terminal import Quiet, print_lines, serve_page
 
 _FILES = ("landmarks.json", "annotated.glb", "attachment.json", "correspondences.json")
 
@@ -49,7 +49,7 @@ def pick(
     from torchface.viz.browser.browser_page import HOST, free_port, import_viser
     from torchface.viz.browser.landmark_sets import IBUG_68, THESIS_12, custom_set
     from torchface.viz.browser.picker import Picker
-    from torchface.workflows.posed_mesh import load_neutral
+    from torchface.workflows.posed_mesh import load_neutral, size_faults
 
     import_viser()
     free_port(HOST, port)
@@ -60,4 +60,6 @@ def pick(
         wanted = custom_set(names) if names else IBUG_68 if landmarks == "68" else THESIS_12
         progress("opening the page")
         picker = Picker(rig or head, target, out, wanted, mode, mesh.stem, port)
+    heads = {f"{mesh} (--unit)": head} | ({} if target is None else {f"{scan} (--scan-unit)": target})
+    print_lines(f"warning: {name}: {fault}" for name, shown in heads.items() for fault in size_faults(shown))
     serve_page(picker)

@@ -34,6 +34,7 @@ def view(
     from torchface.io.rig_files import SCENE_ENDINGS
     from torchface.viz.browser.browser_page import HOST, free_port, import_viser
     from torchface.viz.browser.rig_viewer import RigViewer
+    from torchface.workflows.posed_mesh import size_faults
     from torchface.workflows.weight_files import filled, load_weight_take, without_shape
 
     import_viser()  # what is missing should be said before a large rig is read
@@ -46,11 +47,11 @@ def view(
         progress("reading the rig")
         loaded = load_rig(rig, part=part)
         detail = load_detail_maps(rig) if rig.suffix.lower() in SCENE_ENDINGS else None
-        take, empty, faults = None, 0, []
+        take, empty, faults = None, 0, [f"warning: {rig}: {fault}" for fault in size_faults(loaded.neutral)]
         if weights is not None:
             progress("reading the take")
             take, empty = filled(load_weight_take(weights))
-            faults = [f"warning: {rig} {lost} {weights}" for lost in without_shape(loaded, take.weights)]
+            faults += [f"warning: {rig} {lost} {weights}" for lost in without_shape(loaded, take.weights)]
         progress("opening the page")
         viewer = RigViewer(loaded, take, out, detail, rig.stem, port)
     print_lines(faults)
