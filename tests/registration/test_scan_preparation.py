@@ -13,7 +13,7 @@ from torchface.io import load_landmark_points
 from torchface.mesh import Mesh
 from torchface.registration import DEFAULT_SCHEDULE, Level, Schedule, Stage, register
 from torchface.registration.scan_preparation import check_same_hand, one_side_notes, prepare_scan
-from torchface.synthetic import performer
+from torchface.synthetic import neutral_head, performer
 
 
 def test_an_empty_or_tiny_scan_is_refused(mask: Mesh) -> None:
@@ -100,6 +100,31 @@ def test_a_scan_of_one_side_of_the_face_is_said() -> None:
     assert re.match(
         r"warning: at the person's left the scan shows \d% of the face \((9\d|100)% at the right\)", warning
     )
+
+
+@pytest.mark.parametrize(
+    ("regions", "words"),
+    [
+        (("nose", "nostrils"), "of the nose"),
+        (("chin",), "of the chin"),
+        (("cheek_left", "cheek_right"), "of the cheeks"),
+        (("lids_left", "lids_right"), "of the eyes"),
+        (("upper_lip", "lower_lip", "cheek_left"), "of the mouth"),
+        (("forehead", "cheek_left", "lids_left"), ""),
+    ],
+)
+def test_a_part_of_the_face_that_a_scan_lacks_makes_it_partly_usable(regions: tuple[str, ...], words: str) -> None:
+    head = neutral_head(texture=False)
+    lost = torch.stack([head.annotations.regions[name] for name in regions]).any(0)
+    kept = head.faces[~lost[head.faces].any(1)]
+    scan = Mesh(head.vertices, kept)
+    marks, short = (head.landmarks, head.vertices[head.landmarks]), Schedule(DEFAULT_SCHEDULE.stages[:1])
+    record = register(head, scan, marks, schedule=short, texture_size=0).record
+    warnings = [note for note in record.notes if note.startswith("warning: the scan shows ")]
+    assert len(warnings) == bool(words)
+    assert all(re.fullmatch(rf"warning: the scan shows [0-4]?\d% {words}: the rest is a guess", w) for w in warnings)
+    if words:
+        assert record.verdict().startswith("result: partly usable")
 
 
 def test_landmarks_on_a_line_are_refused(mask: Mesh, make_mask) -> None:

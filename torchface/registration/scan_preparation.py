@@ -12,7 +12,7 @@ from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.mirrored_points import check_mirrored
 from torchface.geometry.similarity import Similarity, similarity_transform
-from torchface.mesh import Mesh
+from torchface.mesh import Annotations, Mesh
 
 LEAST_TRIANGLES = 50  # of a surface that a template is registered to
 _CRUMB = 0.02
@@ -28,6 +28,16 @@ _UNITS = {  # by the power of ten that points are too small by
 }
 _PAIRED = ("brow", "lids", "cheek")
 _ONE_SIDE = 0.65  # of what a scan shows of the other side
+# Of the skin around a part's landmarks, or of its regions: whole scans show 0.7 and more.
+_LEAST_SHOWN, _AROUND = 0.5, 8.0
+_PARTS = {  # rows of iBUG's 68, for each side where there are two
+    "brows": (range(17, 22), range(22, 27)),
+    "eyes": (range(36, 42), range(42, 48)),
+    "nose": (range(27, 36),),
+    "jaw": (range(2, 6), range(11, 15)),
+    "mouth": (range(48, 60),),
+    "chin": (range(6, 11),),
+}
 _LEAST_EXTENT, _MOST_EXTENT = 0.17, 9.0  # of a template's: a scan may show less than the face or the whole person
 
 Landmarks = tuple[Tensor, Tensor]
@@ -192,3 +202,18 @@ def one_side_notes(template: Mesh, matched: Tensor) -> list[str]:
             lost[side].append(f"{min(shown):.0%} of the {part} ({max(shown):.0%} at the {other})")
     said = "warning: at the person's {} the scan shows {}: the rest is a guess"
     return [said.format(side, ", ".join(parts)) for side, parts in lost.items() if parts]
+
+
+def lost_part_notes(template: Mesh, outward: Tensor, shown: Tensor) -> list[str]:
+    """A warning of parts of the face that a scan shows at neither side; of the template's vertices, (V,) bool,
+    ``outward`` can be seen and ``shown`` are, or lie under hair."""
+    notes = template.annotations or Annotations()
+    cheeks = [notes.regions[name].cpu() for name in ("cheek_left", "cheek_right") if name in notes.regions]
+    parts = {"cheeks": cheeks} if cheeks else {}
+    if notes.landmarks is not None and len(notes.landmarks) == 68:
+        points = template.vertices.detach().cpu().double()
+        near = torch.cdist(points[notes.landmarks.cpu()], points) < _AROUND
+        parts |= {part: [near[list(rows)].any(0) for rows in sides] for part, sides in _PARTS.items()}
+    most = {name: max(float(shown[side & outward].double().mean()) for side in sides) for name, sides in parts.items()}
+    lost = [f"{share:.0%} of the {name}" for name, share in most.items() if share < _LEAST_SHOWN]
+    return [f"warning: the scan shows {', '.join(lost)}: the rest is a guess"] if lost else []

@@ -31,7 +31,13 @@ from torchface.registration.scan_colors import (
     with_edge_of_hair,
 )
 from torchface.registration.scan_completion import completed_colors, completed_form
-from torchface.registration.scan_preparation import Landmarks, check_template, one_side_notes, prepare_scan
+from torchface.registration.scan_preparation import (
+    Landmarks,
+    check_template,
+    lost_part_notes,
+    one_side_notes,
+    prepare_scan,
+)
 from torchface.registration.scan_start import Detector, StartOnScan, scale_notes, start_on_scan
 
 _NEAR = 3.0
@@ -179,6 +185,7 @@ def register(
         near, far = f"{fit.noise:.2f} mm (robust deviation)", float(fit.coefficients.abs().max())
         notes.append(f"the model comes to {near} of the scan, {far:.1f} standard deviations off")
     notes += [*_final_notes(template, scan, deformer, texture_size), *one_side_notes(template, matched)]
+    notes += lost_part_notes(template, deformer.outward, matched | deformer.hidden)
     if cover.false_colors:
         notes.append(
             f"{FALSE_COLORS} ({cover.false_colors}, in logarithms): no hair or cloth was looked "
