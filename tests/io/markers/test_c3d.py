@@ -245,6 +245,17 @@ def test_counts_at_the_end_of_16_bits_are_exact_in_files_of_whole_blocks(frames:
     assert len(load_c3d(tmp_path / "take.c3d")) == frames
 
 
+def test_bytes_behind_the_last_count_of_16_bits_are_said(tmp_path: Path) -> None:
+    made, path = _build(np.ones((65_535, 1, 4), np.float32), last_frame=65_535), tmp_path / "take.c3d"
+    path.write_bytes(made + b"made by a program" * 4)
+    with pytest.warns(UserWarning, match=r"take\.c3d: found 65539 frames stored and 65535 announced"):
+        assert len(load_c3d(path)) == 65_539
+    path.write_bytes(made)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(load_c3d(path)) == 65_535
+
+
 def test_a_frame_without_a_marker_loads_and_is_named_on_request(tmp_path: Path) -> None:
     take = _take()
     take.markers.values[[2, 5]] = torch.nan

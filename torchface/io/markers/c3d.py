@@ -9,6 +9,7 @@ Source: The C3D File Format User Guide, Motion Lab Systems.
 
 import re
 import struct
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -91,7 +92,7 @@ def _first_frame(sections: Sections) -> int:
     return sections.header.first_frame
 
 
-def _frame_counts(sections: Sections, stored: int) -> list[float]:
+def _frame_counts(sections: Sections, stored: int, path: Path) -> list[float]:
     """What the file's fields say, the most reliable first; 16 bits of them end at 65,535 or begin again from 0."""
     header = sections.header
     last = sections.numbers("TRIAL:ACTUAL_END_FIELD")
@@ -99,6 +100,13 @@ def _frame_counts(sections: Sections, stored: int) -> list[float]:
     counts = [last[0] + 65536 * last[1] - _first_frame(sections) + 1] if len(last) >= 2 else []
     counts += [count for count in stated if count > _MAX_COUNT]
     if header.last_frame == _MAX_COUNT:
+        said = _MAX_COUNT - header.first_frame + 1
+        if not counts and stored > said:
+            warnings.warn(
+                f"{path}: found {stored} frames stored and {said} announced, where 16 bits count no further: all are "
+                "read; if the take is no longer than announced, the last ones are bytes of another kind",
+                stacklevel=5,
+            )
         return [*counts, stored, *stated]
     count = (header.last_frame - header.first_frame + 1) % 65536
     return [*counts, 65536 if count == 0 and stored > _MAX_COUNT else count, *stated]
@@ -119,7 +127,7 @@ def _positions(data: bytes, sections: Sections, path: Path) -> np.ndarray:
     stored = max(0, len(data) - start) // frame_size
     zeros = BLOCK - len(data[-BLOCK:].rstrip(b"\0"))  # that fill the last block, or the end of the last frame
     full = min(stored, -((start - len(data) + zeros) // frame_size))
-    counts = [count for count in _frame_counts(sections, full) if count >= 1 and float(count).is_integer()]
+    counts = [count for count in _frame_counts(sections, full, path) if count >= 1 and float(count).is_integer()]
     if not counts:
         raise FileFormatError(f"{path}: found no frames, expected at least one")
     fitting = [int(count) for count in counts if count <= stored]
