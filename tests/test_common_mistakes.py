@@ -12,6 +12,7 @@ from torchface import Annotations, Attachment, BlendshapeRig, Mesh, Take, Track
 from torchface.capture import (
     DynamicsPrior,
     ExampleSolver,
+    HelmetSolver,
     HybridSolver,
     MarkerSolver,
     ShapePrior,
@@ -53,6 +54,8 @@ class Given:
         self.heads = self.v + torch.randn(4, *self.v.shape, generator=torch.Generator().manual_seed(0))
         self.model = MorphableModel.fit(self.heads)
         self.regression = ExpressionRegression.fit(self.heads, self.heads[:, None] + self.d[:1], names=["jawOpen"])
+        weights = torch.rand(60, len(rig.names), generator=torch.Generator().manual_seed(0))
+        self.prior = ShapePrior.fit([weights], rig.names)
         self.H, self.q = 2 * torch.eye(3).double(), -torch.ones(4, 3).double()
 
 
@@ -158,6 +161,16 @@ MISTAKES: dict[str, tuple[Callable[[Given], Any], str]] = {
         "program: found the class ProjectedGradient, expected a ProjectedGradient",
     ),
     "a rig for a hybrid solver": (lambda g: HybridSolver(g.rig), "markers: found a BlendshapeRig, expected a MarkerS"),
+    "a path for a helmet's markers": (
+        lambda g: HelmetSolver(g.rig, g.sites)("a.c3d"),
+        "markers: found the text 'a.c3d'",
+    ),
+    "no prediction": (
+        lambda g: HybridSolver(g.solver)(g.markers, None, g.q),
+        "predicted: found None, expected a tensor",
+    ),
+    "a text for a take's markers": (lambda g: WholeTakeSolver(g.solver)("a"), "markers: found the text 'a', expected"),
+    "a text for weights": (lambda g: g.prior.energy("jawOpen"), "weights: found the text 'jawOpen', expected a tensor"),
     "a mesh for a take's solver": (lambda g: WholeTakeSolver(g.mesh), "markers: found a Mesh, expected a MarkerSolv"),
     "a path for a webcam": (lambda g: WebcamSolver("a.glb"), "rig: found the text 'a.glb', .*torchface.load_rig reads"),
     "markers for examples": (lambda g: ExampleSolver(g.markers), "examples: found a tensor .* an ExampleShapes"),
@@ -214,6 +227,11 @@ def test_arrays_and_lists_give_what_tensors_give(given: Given) -> None:
     assert torch.equal(mesh.with_vertices(g.heads[0].numpy()).vertices, g.heads[0])
     for other in (g.markers.numpy(), g.markers.tolist()):
         torch.testing.assert_close(g.solver(other), solved, rtol=0, atol=1e-6)
+        hybrid = HybridSolver(g.solver)(other, np.zeros((3, 4)), [[0.0] * 4] * 3)
+        torch.testing.assert_close(hybrid, solved, rtol=0, atol=1e-6)
+        assert WholeTakeSolver(g.solver)(other).shape == HelmetSolver(g.rig, g.sites)(other)[0].shape == solved.shape
+    weights = [[0.1, 0.2, 0.0, 0.4]]
+    assert torch.equal(g.prior.energy(weights).f, g.prior.energy(torch.tensor(weights)).f)
     expected = box_qp(g.H, g.q)
     H, q = g.H.numpy(), g.q.numpy()
     assert torch.equal(box_qp(g.H, g.q, [0, 0, 0], np.ones(3), start=q), expected)

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
-from torchface.errors import AlignmentError, TopologyError, ValueRangeError
+from torchface.errors import AlignmentError, TopologyError, TorchfaceError, ValueRangeError
 from torchface.geometry.meshes.operators import border_vertices
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
@@ -20,6 +20,16 @@ def test_a_rigid_motion_of_the_input_moves_the_output_alike(model, database):
     still = model(database.smooth[3:6])
     moved = model(database.smooth[3:6] @ turn.T + shift)
     assert torch.allclose(moved, still @ turn.T + shift, atol=1e-3)
+
+
+def test_frames_of_other_precisions_and_arrays_are_taken(model, database):
+    found = model(database.smooth[3:5])
+    assert torch.equal(model(database.smooth[3:5].numpy()), found)
+    assert float((model(database.smooth[3:5].half()) - found).norm(dim=-1).mean()) < 0.1
+    whole = model.low(database.smooth[3:5].round().long())  # whole millimetres
+    assert torch.equal(whole, model.low(database.smooth[3:5].round()))
+    with pytest.raises(TorchfaceError, match=r"coarse: found the text 'a\.glb', expected a tensor"):
+        model("a.glb")
 
 
 def test_the_neutral_gives_the_neutral(model, database):

@@ -18,7 +18,7 @@ from torchface.enhancement.matching.face_regions import Regions
 from torchface.enhancement.prepared_database import PreparedDatabase
 from torchface.errors import TopologyError, ValueRangeError
 from torchface.geometry.similarity import Similarity, similarity_transform
-from torchface.number_checks import MAX_FPS, MIN_FPS, checked_count, checked_number
+from torchface.number_checks import MAX_FPS, MIN_FPS, as_real, checked_count, checked_number
 from torchface.optim.data_dependent import data_dependent
 from torchface.optim.prepared_tensors import Prepared
 from torchface.progress import Progress
@@ -230,7 +230,7 @@ class EnhancementModel(nn.Module):
             AlignmentError: another unit.
             ValueRangeError: NaN or infinity.
         """
-        self._check_frames(coarse)
+        coarse = self._checked(coarse)
         pieces, size = [], max(1, _NUMBERS // len(self.neutral))
         for begin in range(0, len(coarse), size):
             pieces.append(self._enhanced(coarse[begin : begin + size], previous))
@@ -243,13 +243,13 @@ class EnhancementModel(nn.Module):
 
     def features(self, coarse: Tensor) -> Tensor:
         """Rotation vector and stretch of each patch of the smooth part, (T,P,9), of frames (T,V,3)."""
-        self._check_frames(coarse)
+        coarse = self._checked(coarse)
         smooth, encoder = self._smooth(coarse)[0], self.prepared.encoder
         return encoder.gradients.features(smooth, encoder.frames.turned(smooth))
 
     def low(self, coarse: Tensor) -> Tensor:
         """The smooth part of frames (T,V,3), aligned with the neutral."""
-        self._check_frames(coarse)
+        coarse = self._checked(coarse)
         return self.neutral.to(coarse) + self._smooth(coarse)[0]
 
     def colors(self, weights: Tensor) -> Tensor:
@@ -389,7 +389,8 @@ class EnhancementModel(nn.Module):
         displacements, pose = encoder.alignment.aligned(coarse, "coarse")
         return encoder.low_pass(displacements), displacements, pose
 
-    def _check_frames(self, coarse: Tensor) -> None:
+    def _checked(self, coarse: Tensor) -> Tensor:
+        coarse = as_real(coarse, "coarse")
         if coarse.ndim != 3 or coarse.shape[1:] != self.neutral.shape:
             raise TopologyError(
                 f"coarse: found {tuple(coarse.shape)}, expected (T,{len(self.neutral)},3): frames of the model's own "
@@ -398,3 +399,4 @@ class EnhancementModel(nn.Module):
         bad = (~torch.isfinite(coarse.detach())).any(-1).any(-1).nonzero()[:, 0]
         if len(bad):
             raise ValueRangeError(f"coarse: frame {int(bad[0])} holds NaN or infinite vertices, expected none")
+        return coarse.float() if coarse.dtype in (torch.float16, torch.bfloat16) else coarse  # sparse ones know neither

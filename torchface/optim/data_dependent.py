@@ -4,6 +4,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, ParamSpec, TypeVar
 
+import numpy as np
 import torch
 
 from torchface.errors import TraceError
@@ -19,7 +20,7 @@ def data_dependent(instead: str) -> Callable[[Callable[Given, Result]], Callable
 
     ``torch.compile`` leaves a gap in its graph for it, in which it runs as ever: what it would compile of such a
     method are dozens of pieces, for minutes. What follows one path only is refused at once: ``torch.jit.trace``,
-    ``torch.export`` and the transforms of ``torch.func``. Tensors of integers become floats.
+    ``torch.export`` and the transforms of ``torch.func``. Integers become floats, NumPy's arrays tensors.
 
     Example:
         >>> @data_dependent("a series")
@@ -61,7 +62,7 @@ def data_dependent(instead: str) -> Callable[[Callable[Given, Result]], Callable
 
 
 def _real(value: Any) -> Any:
-    return as_real(value) if isinstance(value, torch.Tensor) else value
+    return as_real(value) if isinstance(value, torch.Tensor | np.ndarray) else value
 
 
 def is_transformed() -> bool:

@@ -98,6 +98,9 @@ def test_what_does_not_fit_is_refused(
     vertices = rig(poses[:2])
     with pytest.raises(TopologyError, match=f"{len(rig.vertices)},3"):
         learned.predict(vertices[:, :-1])
+    with pytest.raises(TopologyError, match=f"{len(rig.vertices)},3"):
+        learned(torch.cat([vertices, vertices], 1))
+    torch.testing.assert_close(learned.predict(vertices.double().numpy()), learned(vertices))
     vertices[1, 7] = torch.nan
     with pytest.raises(ValueRangeError, match="frame 1"):
         learned.predict(vertices)

@@ -13,6 +13,7 @@ from torchface.capture.markers.helmet_motion import HelmetMotion, rigid_columns,
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY, MarkerSolver
 from torchface.errors import ShapeError
 from torchface.geometry.similarity import Similarity
+from torchface.number_checks import as_real
 from torchface.optim import BoxQP, box_qp
 from torchface.optim.box_checks import default_tolerance
 from torchface.optim.data_dependent import data_dependent
@@ -94,6 +95,7 @@ class HelmetSolver(nn.Module):
             ShapeError: ``markers`` is not (B,M,3).
             ValueRangeError: a coordinate is infinite, or frames show no marker at all.
         """
+        markers = as_real(markers, "markers")
         if markers.ndim != 3 or markers.shape[1:] != self.markers.rest.shape:
             raise ShapeError(f"markers: found {tuple(markers.shape)}, expected (B,{len(self.markers.rest)},3)")
         seen = self.markers.in_rig_space(markers.double())

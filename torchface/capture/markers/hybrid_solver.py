@@ -10,7 +10,7 @@ from torchface.capture.energy import Quadratic, chunks_of_frames, pull_term
 from torchface.capture.markers.given_markers import frames_seen
 from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
-from torchface.number_checks import LARGEST_WEIGHT, checked_number, checked_type
+from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_number, checked_type
 from torchface.optim.box_checks import default_tolerance
 from torchface.optim.data_dependent import data_dependent
 from torchface.take import Take, Track
@@ -111,6 +111,8 @@ class HybridSolver(nn.Module):
             ShapeError: the shapes do not fit each other.
             ValueRangeError: a prediction that counts is NaN or outside [0,1], or a gamma is negative or not finite.
         """
+        given = {"markers": markers, "predicted": predicted, "gamma": gamma}
+        markers, predicted, gamma = (as_real(value, name) for name, value in given.items())
         check_predictions(predicted, gamma, (len(markers), len(self.names)))
         alone: Tensor = self.markers(markers)
         pulled = (gamma > 0).any(1).nonzero()[:, 0]

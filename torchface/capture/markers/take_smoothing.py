@@ -13,7 +13,7 @@ from torchface.capture.markers.hybrid_solver import check_predictions, in_rig_or
 from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
 from torchface.capture.markers.smooth_problem import HUBER_THRESHOLD, REFERENCE_FPS, Pull, SmoothProblem, huber
 from torchface.errors import ShapeError, TraceError, ValueRangeError
-from torchface.number_checks import LARGEST_WEIGHT, check_rate, checked_number, checked_type
+from torchface.number_checks import LARGEST_WEIGHT, as_real, check_rate, checked_number, checked_type
 from torchface.optim.data_dependent import data_dependent
 from torchface.take import Take, Track
 from torchface.temporal import interpolated
@@ -126,6 +126,7 @@ class WholeTakeSolver(nn.Module):
             ValueRangeError: no frame shows any marker, or a coordinate is infinite; or nearly all would be gaps.
             TraceError: ``markers`` ask for gradients.
         """
+        markers = as_real(markers, "markers")
         if markers.requires_grad and torch.is_grad_enabled():
             raise TraceError(
                 "WholeTakeSolver: found markers that ask for gradients, expected none, or MarkerSolver, which has them"

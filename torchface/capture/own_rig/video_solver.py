@@ -23,6 +23,7 @@ from torchface.capture.own_rig.weight_walk import (
 )
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.pnp import solve_pnp
+from torchface.number_checks import as_real
 from torchface.optim.blas_threads import one_blas_thread
 from torchface.optim.data_dependent import data_dependent
 from torchface.progress import Progress, silent
@@ -111,6 +112,7 @@ class VideoSolver(FrameSolver):
             ShapeError: the shapes do not fit each other.
             ValueRangeError: infinite landmarks, confidences below 0, or no frame with six trusted landmarks.
         """
+        landmarks = as_real(landmarks, "landmarks")
         states, _ = self.states(landmarks, rotation, translation, confidence, seconds, progress, measured)
         weights, rotations, translations = (
             torch.stack([getattr(state, name) for state in states]).to(landmarks.dtype)

@@ -53,9 +53,10 @@ def moving_parts(windows: Tensor, motion: Tensor) -> Tensor:
 
 def newest_frames(windows: Tensor, window: int, shapes: int) -> Tensor:
     """The last ``window`` frames (B,J,N) of windows (B,J',N)."""
+    windows = as_real(windows, "windows")
     if windows.ndim != 3 or windows.shape[1] < window or windows.shape[2] != shapes:
         raise ShapeError(f"windows: found {tuple(windows.shape)}, expected (B,{window},{shapes}) or more frames")
-    return as_real(windows[:, -window:])
+    return windows[:, -window:]
 
 
 def windows_of(weights: Tensor, window: int) -> tuple[Tensor, Tensor]:

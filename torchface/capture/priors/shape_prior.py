@@ -161,9 +161,10 @@ class ShapePrior(nn.Module):
         return [(density, weights[:, list(group)]) for density, group in zip(densities, self.groups, strict=True)]
 
     def _checked(self, weights: Tensor) -> Tensor:
+        weights = as_real(weights, "weights")
         if weights.ndim != 2 or weights.shape[1] != len(self.names):
             raise ShapeError(f"weights: found {tuple(weights.shape)}, expected (B,{len(self.names)})")
-        return as_real(weights)
+        return weights
 
     def prepared(self, strength: float | None = None) -> StudentGroups:
         """The same energy for solvers that are exported, or one of another strength.

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from torchface.errors import ShapeError, TopologyError, ValueRangeError
-from torchface.number_checks import checked_count
+from torchface.number_checks import as_real, checked_count
 from torchface.optim.eigenpairs import largest_eigenpairs
 from torchface.optim.full_precision import full_precision
 from torchface.rig import BlendshapeRig
@@ -134,15 +134,17 @@ class WrinkleWeights(nn.Module):
     @full_precision
     def forward(self, vertices: Tensor) -> Tensor:
         """Weights of the maps, (T,R,M), in [0,1], of the rig's vertices (T,V,3), millimetres, in any rigid place."""
-        return self.of_moments(self.moments(vertices.index_select(1, self.sites) - self.neutral))
-
-    def predict(self, vertices: Tensor) -> Tensor:
-        """As :meth:`forward`, which an engine has as a graph, with its input checked."""
+        vertices = as_real(vertices, "vertices").to(self.rows)
         if vertices.ndim != 3 or vertices.shape[1:] != (self.vertex_count, 3):
             raise TopologyError(
                 f"vertices: found {tuple(vertices.shape)}, expected (T,{self.vertex_count},3): poses of the rig that "
                 "the weights were learned for"
             )
+        return self.of_moments(self.moments(vertices.index_select(1, self.sites) - self.neutral))
+
+    def predict(self, vertices: Tensor) -> Tensor:
+        """As :meth:`forward`, which an engine has as a graph, with its numbers checked."""
+        vertices = as_real(vertices, "vertices")
         bad = (~torch.isfinite(vertices)).flatten(1).any(1).nonzero()[:, 0]
         if len(bad):
             raise ValueRangeError(f"vertices: frame {int(bad[0])} holds NaN or infinity, expected millimetres")
