@@ -148,7 +148,7 @@ class VideoGraph(nn.Module):
         before = torch.where(first, 0.0, state["hidden"])[None] if self.walks else torch.zeros_like(evidence)
         hidden = unseen_time(before, evidence, interval)
         if self.walks:
-            mean, information = self._walked(head, evidence, hidden, before.amin(), first)
+            mean, information = self._walked(head, evidence, hidden, before.amin(1), first)
         else:
             mean, information = self._expected(head, window, first, state)
         noise = self.step.solver.noise(head.rotation, head.translation)
@@ -209,7 +209,7 @@ class VideoGraph(nn.Module):
     ) -> tuple[HeadState, Tensor]:
         """The prediction for this frame from the last one's weights and pose: the mean and its information (N+6,N+6).
 
-        A face that was ``lost`` for so many seconds, (), may be further away.
+        A face that was ``lost`` for so many seconds, (1,), may be further away.
         """
         interval = self.settings.interval
         walked = self.step.solver.walked(head, evidence, hidden, interval, interval + lost)
