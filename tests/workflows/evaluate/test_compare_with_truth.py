@@ -124,6 +124,18 @@ def test_files_of_one_name_are_named_with_their_folders(folder: Path, weights: t
     assert f"{places[0]} against {places[1]}" in page
 
 
+def test_shapes_that_the_result_does_not_have_are_named(folder: Path, weights: torch.Tensor) -> None:
+    """A program that gives no brows has them at rest, which is no finding."""
+    settings = EvaluationSettings(rig=folder / "rig.glb")
+    for kept, named in (((0, 2), "browInnerUp, mouthSmileRight"), ((0, 1, 2, 3), None)):
+        track = Track([NAMES[i] for i in kept], weights[:, list(kept), None])
+        save_weights_csv(Take(30.0, weights=track), folder / "part.csv")
+        lines = evaluate(folder / "part.csv", folder / "true.csv", folder / "out", settings).lines()
+        assert [line for line in lines if "part.csv has no" in line] == (
+            [] if named is None else [f"part.csv has no {named}, which true.csv moves: taken for 0"]
+        )
+
+
 def test_alignment_is_done_where_it_is_asked_for(folder: Path, rig: BlendshapeRig, weights: torch.Tensor) -> None:
     turn = rotation_matrix(torch.tensor([0.0, 0.2, 0.0]))
     moved = rig(weights) @ turn.T + torch.tensor([10.0, 0.0, 0.0])

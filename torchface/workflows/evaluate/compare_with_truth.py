@@ -24,6 +24,7 @@ _SAME_RATE = 0.002
 _SAME_FRAME = 0.25  # of a frame by which times may differ
 _ROUNDED = 1e-6  # seconds
 _REACH = 0.4
+_MOVED, _NAMED = 0.01, 5  # a weight from which a shape moves; shapes that are named
 _GROUPS = ("round the jaw", "round the brows", "round the nose", "round the eyes", "round the mouth")
 _GROUP_OF_LANDMARK = (*[0] * 17, *[1] * 10, *[2] * 9, *[3] * 12, *[4] * 20)
 
@@ -91,6 +92,7 @@ def compare(found: AnimatedMesh, true: AnimatedMesh, settings: EvaluationSetting
     if empty.any():
         first = int(frames[empty][0])
         notes.append(f"{int(empty.sum())} of {len(frames)} frames are NaN (the first {first}) and were left out")
+    notes += _absent(found, true)
     maximum = settings.maximum
     if maximum is not None and not 0 < maximum < float("inf"):
         raise ValueRangeError(f"scale: found {maximum}, expected a positive number of millimetres")
@@ -185,8 +187,8 @@ def _frames(found: AnimatedMesh, true: AnimatedMesh, chosen: tuple[int, ...] | N
     if chosen is None:
         if found.count != true.count:
             raise ShapeError(
-                f"{found.path}: found {found.count} frames, expected the {true.count} of {true.path}; or say which "
-                "of the result's frames they are (--frames)"
+                f"{found.path}: found {found.count} frames, expected the {true.count} of {true.path}; "
+                + ("cut the truth" if found.count < true.count else "or say which of the result's they are (--frames)")
             )
         return torch.arange(found.count)
     wrong = [frame for frame in chosen if not 0 <= frame < found.count]
@@ -252,6 +254,19 @@ def _shapes(found: AnimatedMesh, true: AnimatedMesh, frames: Tensor, true_rows: 
     solved = found.weights.values[frames, :, 0]
     actual = values_at(true.weights.values[..., 0], torch.arange(true.count), true_rows)
     return shape_errors(solved, found.weights.names, actual, true.weights.names)
+
+
+def _absent(found: AnimatedMesh, true: AnimatedMesh) -> list[str]:
+    """What is to be said of shapes that the truth's file moves and of which the result's has no column."""
+    tracks = [None if one.take is None else one.take.weights for one in (found, true)]
+    if tracks[0] is None or tracks[1] is None:
+        return []
+    moved = tracks[1].values[..., 0].nan_to_num().abs().amax(0) > _MOVED
+    given = mapping(tracks[0].names, tracks[1].names).any(1)
+    names = [name for name, absent in zip(tracks[1].names, (moved & ~given).tolist(), strict=True) if absent]
+    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    what = f"{found.path.name} has no {', '.join(names[:_NAMED])}{more}, which {true.path.name} moves: taken for 0"
+    return [what] if names else []
 
 
 def compared_regions(mesh: Mesh) -> dict[str, Tensor]:
