@@ -28,12 +28,20 @@ from torchface.errors import ArgumentTypeError, TorchfaceError
 from torchface.landmarks import find_faces
 from torchface.modeling import (
     ExpressionRegression,
+    ExpressionSettings,
     HeadModel,
     MorphableModel,
+    RiggingSchedule,
     align_scan,
     bake_normal_map,
     corrective_from_sculpt,
+    detail_maps,
+    inner_parts,
+    neutral_notes,
+    open_eyes,
+    rig_from_examples,
     rig_from_neutral,
+    shapes_on,
     transfer_deformation,
 )
 from torchface.onnx import export_module
@@ -171,6 +179,35 @@ MISTAKES: dict[str, tuple[Callable[[Given], Any], str]] = {
     ),
     "a text for a take's markers": (lambda g: WholeTakeSolver(g.solver)("a"), "markers: found the text 'a', expected"),
     "a text for weights": (lambda g: g.prior.energy("jawOpen"), "weights: found the text 'jawOpen', expected a tensor"),
+    "a weight as a text": (lambda g: transfer_deformation(g.rig, g.mesh, "30"), "contact_weight: found '30', expected"),
+    "settings as a dict": (
+        lambda g: ExpressionRegression.fit(g.heads, g.heads[:, None], {"ridge": 0.1}),
+        "settings: found a dict, expected an ExpressionSettings",
+    ),
+    "a form that is none": (lambda g: ExpressionSettings(form="poses"), "form: found 'poses', expected one of offsets"),
+    "a batch of weights": (
+        lambda g: corrective_from_sculpt(g.rig, [[1.0, 1, 0, 0]], g.v),
+        r"weights: found \(1, 4\), expected \(4,\)",
+    ),
+    "a sculpt of another head": (
+        lambda g: corrective_from_sculpt(g.rig, [1.0, 1, 0, 0], g.v[:-1]),
+        r"sculpt: found \(624, 3\), expected \(625, 3\)",
+    ),
+    "one number for two": (lambda g: RiggingSchedule(beta=0.5), "beta: found 0.5, expected two numbers"),
+    "a schedule as a number": (
+        lambda g: rig_from_examples(g.rig, g.mesh, g.heads[:1], torch.eye(4)[:1], 5),
+        "schedule: found an int, expected a RiggingSchedule",
+    ),
+    "an alignment as a text": (
+        lambda g: bake_normal_map(g.mesh, g.mesh, 8, alignment="x"),
+        "alignment: found the text",
+    ),
+    "settings as a number": (lambda g: bake_normal_map(g.mesh, g.mesh, 8, settings=3), "settings: found an int, exp"),
+    "meshes for maps": (lambda g: detail_maps(["a"], [g.mesh]), "a map: found a Mesh, expected a NormalMap"),
+    "a mesh with open eyes": (lambda g: open_eyes(g.mesh, g.mesh), "template: found a Mesh, expected a BlendshapeRig"),
+    "parts of a mesh": (lambda g: inner_parts(g.mesh), "template: found a Mesh, expected a BlendshapeRig"),
+    "notes on a rig": (lambda g: neutral_notes(g.rig, g.rig), "head: found a BlendshapeRig, expected a Mesh"),
+    "shapes of a mesh": (lambda g: shapes_on(g.mesh, g.mesh), "template: found a Mesh, expected a BlendshapeRig"),
     "a mesh for a take's solver": (lambda g: WholeTakeSolver(g.mesh), "markers: found a Mesh, expected a MarkerSolv"),
     "a path for a webcam": (lambda g: WebcamSolver("a.glb"), "rig: found the text 'a.glb', .*torchface.load_rig reads"),
     "markers for examples": (lambda g: ExampleSolver(g.markers), "examples: found a tensor .* an ExampleShapes"),

@@ -80,15 +80,13 @@ def as_tensor(name: str, value: object, expected: str, dtype: torch.dtype | None
     return made if dtype is None else made.to(dtype)
 
 
-def checked_indices(name: str, value: object, count: int) -> torch.Tensor:
+def checked_indices(name: str, value: object, count: int, error: type[TorchfaceError] = TopologyError) -> torch.Tensor:
     """The tensor itself, or one of a list or an array, where it is of whole numbers from 0 to below ``count``."""
     indices = as_tensor(name, value, "of whole numbers", torch.int64)
     if indices.dtype != torch.int64:
-        raise TopologyError(f"{name}: found {indices.dtype}, expected torch.int64")
+        raise error(f"{name}: found {indices.dtype}, expected torch.int64")
     if indices.numel() and (int(indices.min()) < 0 or int(indices.max()) >= count):
-        raise TopologyError(
-            f"{name}: found indices {int(indices.min())} to {int(indices.max())}, expected 0 to {count - 1}"
-        )
+        raise error(f"{name}: found indices {int(indices.min())} to {int(indices.max())}, expected 0 to {count - 1}")
     return indices
 
 

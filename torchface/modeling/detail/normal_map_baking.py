@@ -142,6 +142,9 @@ def bake_normal_map(
         >>> bool(baked.statistics.far_distance < 0.01), bool(baked.normals[2].median() > 0.99)
         (True, True)
     """
+    checked_type("settings", settings, BakeSettings)
+    if alignment is not None:
+        checked_type("alignment", alignment, Similarity)
     height, width = _checked_size(size)
     uvs, uv_faces = _checked_meshes(mesh, high_resolution_scan)
     found = None
@@ -202,6 +205,8 @@ def detail_maps(names: Sequence[str], baked: Sequence[NormalMap], neutral: Norma
         >>> maps.names, maps.maps.shape == (1, 3, 16, 16)
         (('jawOpen',), True)
     """
+    for one in (*baked, *([neutral] if neutral else [])):
+        checked_type("a map", one, NormalMap)
     sizes = {tuple(one.normals.shape) for one in (*baked, *([neutral] if neutral else []))}
     if len(baked) == 0 or len(sizes) != 1:
         raise ShapeError(f"detail_maps: found {len(baked)} maps of sizes {sorted(sizes)}, expected some of one size")

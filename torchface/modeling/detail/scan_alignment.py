@@ -99,7 +99,8 @@ def align_scan(
 def _picked(mesh: Mesh, correspondences: Correspondences) -> tuple[Tensor, Tensor]:
     on_mesh, on_scan = (as_tensor("correspondences", one, "(L,) or (L,3)").detach() for one in correspondences)
     if on_mesh.ndim == 1:
-        on_mesh = mesh.vertices[checked_indices("correspondences", on_mesh, len(mesh.vertices))]
+        name = "correspondences: vertices of the mesh"
+        on_mesh = mesh.vertices[checked_indices(name, on_mesh, len(mesh.vertices), ValueRangeError)]
     shapes = f"{tuple(on_mesh.shape)} and {tuple(on_scan.shape)}"
     if on_mesh.shape != on_scan.shape or on_mesh.ndim != 2 or on_mesh.shape[1] != 3:
         raise ShapeError(f"correspondences: found {shapes}, expected vertex ids (L,) or points (L,3), and points (L,3)")

@@ -183,15 +183,14 @@ class MorphableModel(nn.Module):
 
         Raises:
             ShapeError: the shapes differ from the above.
-            ValueRangeError: infinity, or noise that is not positive.
-            TopologyError: vertex ids outside the model.
+            ValueRangeError: infinity, noise that is not positive, or vertex ids outside the model.
 
         Source: thesis 3.2.4; Albrecht, Luethi, Vetter 2008 (posterior shape models).
         """
         samples = as_tensor("samples", samples, "(B,V,C)").to(self.mean)
         mean, components = self.mean, self.components
         if vertices is not None:
-            vertices = checked_indices("vertices", vertices, len(mean)).flatten()
+            vertices = checked_indices("vertices", vertices, len(mean), ValueRangeError).flatten()
             mean, components = mean[vertices], components[:, vertices]
         if samples.ndim != 3 or samples.shape[1:] != mean.shape:
             raise ShapeError(f"samples: found {tuple(samples.shape)}, expected (B,{mean.shape[0]},{mean.shape[1]})")
@@ -259,7 +258,7 @@ class MorphableModel(nn.Module):
         """The same distribution seen at some vertices only, ids (N,) or a mask (V,); its components are orthonormal
         there."""
         if getattr(vertices, "dtype", None) != torch.bool:
-            vertices = checked_indices("vertices", vertices, len(self.mean)).flatten()
+            vertices = checked_indices("vertices", vertices, len(self.mean), ValueRangeError).flatten()
         modes = self.modes[:, vertices].double().flatten(1)
         _, deviations, components = torch.linalg.svd(modes, full_matrices=False)
         kept = deviations > 1e-6 * deviations[0].clamp(min=1e-12)

@@ -12,7 +12,7 @@ from torchface.mesh import Mesh
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.penetration import inner_parts
 from torchface.modeling.rigging.transfer_system import ShapeTransfer
-from torchface.number_checks import checked_type
+from torchface.number_checks import checked_number, checked_type
 from torchface.progress import Progress
 from torchface.registration.own_topology import check_own_topology
 from torchface.rig import BlendshapeRig
@@ -177,6 +177,5 @@ def _check(source: BlendshapeRig, target: Mesh, contact_weight: float) -> None:
     for what, vertices in (("source", source.vertices), ("target", target.vertices)):
         if not torch.isfinite(vertices).all():
             raise ValueRangeError(f"transfer_deformation: found NaN or infinite vertices in the {what}; expected none")
-    if not 0 <= contact_weight < float("inf"):
-        raise ValueRangeError(f"contact_weight: found {contact_weight}, expected a finite number of at least 0")
+    checked_number("contact_weight", contact_weight)
     check_own_topology(source.neutral, target)

@@ -14,7 +14,7 @@ from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import CONTACT_WEIGHT, TransferReport, transfer_report
 from torchface.modeling.rigging.example_gradients import example_shares, personal_part, shape_stiffness
 from torchface.modeling.rigging.transfer_system import ShapeTransfer
-from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_count, checked_number
+from torchface.number_checks import LARGEST_WEIGHT, as_real, checked_count, checked_number, checked_type
 from torchface.optim import box_qp
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
@@ -60,7 +60,7 @@ class RiggingSchedule:
     def __post_init__(self) -> None:
         checked_count("iterations", self.iterations, 1)
         for name in ("beta", "gamma"):
-            if len(getattr(self, name)) != 2:
+            if not isinstance(getattr(self, name), tuple | list) or len(getattr(self, name)) != 2:
                 raise ShapeError(f"{name}: found {getattr(self, name)}, expected two numbers, first and last iteration")
         for name, numbers in (
             ("beta", self.beta),
@@ -159,7 +159,8 @@ def rig_from_examples(
     progress = progress or silent
     examples, weights = as_real(examples, "examples"), as_real(weights, "weights")
     _check(template, neutral, examples, weights, contact_weight)
-    job = _Rigging(template, neutral, examples, weights, schedule or RiggingSchedule(), contact_weight)
+    schedule = checked_type("schedule", schedule or RiggingSchedule(), RiggingSchedule)
+    job = _Rigging(template, neutral, examples, weights, schedule, contact_weight)
     for number in range(job.schedule.iterations):
         beta, gamma = job.schedule.at(number)
         job.solve_shapes(beta)

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import torch
 from torch import Tensor, nn
@@ -49,6 +49,8 @@ class ExpressionSettings:
                 checked_count(what, getattr(self, what), 1)
         if self.ridge is not None:
             checked_number("ridge", self.ridge, most=LARGEST_WEIGHT)
+        if self.form not in get_args(Form):
+            raise ValueRangeError(f"form: found {self.form!r}, expected one of {', '.join(get_args(Form))}")
 
 
 class ExpressionRegression(nn.Module):

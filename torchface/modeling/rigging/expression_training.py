@@ -11,7 +11,7 @@ from torchface.geometry.sample_batches import Samples, SamplesInMemory, blocks
 from torchface.modeling.morphable.principal_components import PrincipalComponents, principal_components
 from torchface.modeling.rigging.expression_regression import STILL, ExpressionRegression, ExpressionSettings, Form
 from torchface.modeling.rigging.people_together import MovingPlaces, NeutralRegion, Predicted, align_neutrals
-from torchface.number_checks import as_tensor
+from torchface.number_checks import as_tensor, checked_type
 from torchface.optim.eigenpairs import largest_eigenpairs
 from torchface.progress import Progress, silent
 
@@ -32,6 +32,7 @@ def fit_expressions(
     progress: Progress | None,
 ) -> ExpressionRegression:
     """The regression of :meth:`ExpressionRegression.fit`, which says what the arguments are."""
+    checked_type("settings", settings, ExpressionSettings)
     neutrals, expressions, names = _people(neutrals, expressions, names)
     progress = progress or silent
     form, ridge = settings.form, settings.ridge

@@ -8,6 +8,7 @@ from torchface.geometry.meshes.operators import edges
 from torchface.geometry.meshes.unit_check import extent
 from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh
+from torchface.number_checks import checked_type
 from torchface.optim.box_qp import box_qp
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import ARKIT, recognised_mapping
@@ -46,7 +47,8 @@ def neutral_notes(template: BlendshapeRig, head: Mesh) -> tuple[str, ...]:
         >>> neutral_notes(actor, actor.neutral.with_vertices(1.1 * actor.vertices))
         ()
     """
-    rest, goal = (mesh.vertices.detach().cpu().double() for mesh in (template.neutral, head))
+    meshes = checked_type("template", template, BlendshapeRig).neutral, checked_type("head", head, Mesh)
+    rest, goal = (mesh.vertices.detach().cpu().double() for mesh in meshes)
     if rest.shape != goal.shape:
         raise TopologyError(f"head: found {len(goal)} vertices, expected the template's {len(rest)}")
     used = template.neutral.faces.cpu().unique()

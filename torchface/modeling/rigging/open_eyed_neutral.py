@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from torchface.errors import NameMismatchError
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.deformation_transfer import CONTACT_WEIGHT, transfer_with_report
+from torchface.number_checks import checked_type
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import mapping
 
@@ -50,6 +51,7 @@ def open_eyes(
         >>> bool((opened.vertices - actor.vertices).norm(dim=1).max() < 1)  # millimetres
         True
     """
+    checked_type("template", template, BlendshapeRig)
     if shapes is None:
         means_blink = mapping(_BLINKS, template.names).any(1)
         if not means_blink.any():

@@ -20,6 +20,7 @@ from torchface.modeling.rigging.loose_parts import moved_parts
 from torchface.modeling.rigging.part_clearance import clear_parts
 from torchface.modeling.rigging.part_placement import place_parts
 from torchface.modeling.rigging.penetration import InnerParts, inner_parts
+from torchface.number_checks import checked_type
 from torchface.optim.sparse import SparseCholesky
 from torchface.progress import Progress, silent
 from torchface.registration import Registration, hidden_parts, register, with_template_skin
@@ -96,6 +97,8 @@ def shapes_on(
         (('jawOpen',), True)
     """
     progress = progress or silent
+    checked_type("template", template, BlendshapeRig)
+    checked_type("target", target, Mesh)
     if movable is not None and movable.shape != target.vertices.shape[:1]:
         raise ValueRangeError(f"movable: found {tuple(movable.shape)}, expected ({len(target.vertices)},)")
     template = template.linear("shapes_on")

@@ -13,6 +13,7 @@ from torchface.geometry.meshes.operators import components, triangle_normals, ve
 from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh
+from torchface.number_checks import checked_type
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 
@@ -127,7 +128,7 @@ def inner_parts(template: BlendshapeRig) -> InnerParts:
         >>> bool(parts.hard.any()), len(parts.vertices) < len(actor.vertices)  # eyeballs are bone
         (True, True)
     """
-    mesh = template.neutral
+    mesh = checked_type("template", template, BlendshapeRig).neutral
     vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
     label = components(faces, len(vertices))
     body = int(label.bincount().argmax())

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from torchface.correctives import Corrective, Correctives
-from torchface.errors import AlignmentError, NameMismatchError, TopologyError, ValueRangeError
+from torchface.errors import AlignmentError, NameMismatchError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
@@ -113,6 +113,9 @@ def corrective_from_sculpt(
     checked_type("rig", rig, BlendshapeRig)
     weights = as_tensor("weights", weights, "(N,)").detach().cpu().double()
     sculpt = as_tensor("sculpt", sculpt, "(V,3)").detach().cpu().double()
+    for what, given, expected in (("weights", weights, rig.deltas[:, 0, 0]), ("sculpt", sculpt, rig.vertices)):
+        if given.shape != expected.shape:
+            raise ShapeError(f"{what}: found {tuple(given.shape)}, expected {tuple(expected.shape)}")
     rows = weights.nonzero()[:, 0].tolist()
     pose = " ".join(f"{rig.names[row]}={float(weights[row]):.4g}" for row in rows)
     if not rows or not bool(((weights >= 0) & (weights <= 1)).all()):
