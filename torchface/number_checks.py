@@ -138,7 +138,7 @@ def _described(value: object) -> str:
     return f"{'an' if word[0] in 'AEIOaeio' else 'a'} {word}"
 
 
-def as_real(values: torch.Tensor, name: str = "values") -> torch.Tensor:
+def as_real(values: object, name: str = "values") -> torch.Tensor:
     """Whole numbers as floats of torch's default dtype: weights solved in an integer dtype would all be 0 or 1.
 
     NumPy's arrays and lists become tensors of that dtype, see :func:`as_tensor`.
@@ -147,8 +147,8 @@ def as_real(values: torch.Tensor, name: str = "values") -> torch.Tensor:
         >>> as_real(torch.tensor([3, 4])).is_floating_point()
         True
     """
-    values = as_tensor(name, values, "of numbers", torch.get_default_dtype())
-    return values if values.is_floating_point() or values.is_complex() else values.to(torch.get_default_dtype())
+    made = as_tensor(name, values, "of numbers", torch.get_default_dtype())
+    return made if made.is_floating_point() or made.is_complex() else made.to(torch.get_default_dtype())
 
 
 def check_rate(fps: object, where: str, error: type[TorchfaceError] = FileFormatError) -> float:

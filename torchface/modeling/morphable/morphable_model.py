@@ -292,7 +292,7 @@ class MorphableModel(nn.Module):
         )
 
     def _checked(self, coefficients: Tensor | list[Tensor]) -> Tensor:
-        coefficients = as_real(coefficients, "coefficients")  # type: ignore[arg-type]
+        coefficients = as_real(coefficients, "coefficients")
         if coefficients.ndim != 2 or coefficients.shape[1] != self.count:
             raise ShapeError(f"coefficients: found {tuple(coefficients.shape)}, expected (B,{self.count})")
         return coefficients
