@@ -314,6 +314,15 @@ def test_a_head_that_a_page_cannot_show_for_its_size_is_said(
         assert f"warning:{name}:0.".replace(" ", "") in said
 
 
+def test_picks_that_could_not_be_saved_are_not_begun(
+    stage: Path, monkeypatch: pytest.MonkeyPatch, messages_of: Callable[..., str]
+) -> None:
+    pytest.importorskip("viser")
+    monkeypatch.setattr(sys.modules["torchface.cli.pick"], "serve_page", lambda page: page.stop())
+    said = messages_of("pick", stage / "rig.glb", "--out", stage / "file", "--port", "0", status=2)
+    assert f"{stage / 'file'}: cannot be written" in said
+
+
 @pytest.mark.parametrize("words", ["export --help", "--version", "--help"])
 def test_output_that_nobody_reads_ends_quietly(words: str) -> None:
     code = "from torchface.cli import main; import sys; sys.stdin.read(); main()"

@@ -45,6 +45,7 @@ def pick(
         part: Keep this region only, such as face.
         port: The first port to try.
     """
+    from torchface.files.whole_files import check_writable
     from torchface.io import load_mesh
     from torchface.viz.browser.browser_page import HOST, free_port, import_viser
     from torchface.viz.browser.landmark_sets import IBUG_68, THESIS_12, custom_set
@@ -53,6 +54,7 @@ def pick(
 
     import_viser()
     free_port(HOST, port)
+    check_writable(folder=out)
     with progress_bars(quiet) as progress:
         progress("reading")
         head, rig = load_neutral(mesh, unit, part)
