@@ -48,7 +48,7 @@ def checked_count(
     """The whole number itself, where it is in its range; as :func:`checked_number`, but 3.0 is no whole number."""
     fraction = isinstance(value, float) or (isinstance(value, torch.Tensor) and value.is_floating_point())
     if fraction or not least <= _real(value) <= most:
-        found = f"{_real(value):.1f}" if fraction and _real(value).is_integer() else _shown(value)
+        found = f"{_shown(value)}.0" if fraction and _real(value) in range(10**6) else _shown(value)
         raise error(f"{name}: found {found}, expected {_range_text('a whole number', least, most)}")
     return int(_real(value))
 
