@@ -57,12 +57,12 @@ def written(
         return export_video_solver(rig, CAMERA, path, ShapePrior.fit(takes, SEEN), dynamics, facts={"licence": "MIT"})
 
 
-def played(graph: VideoGraph, landmarks: Tensor) -> list[dict[str, Tensor]]:
+def played(graph: VideoGraph, landmarks: Tensor, trust: Tensor | None = None) -> list[dict[str, Tensor]]:
     """Every frame's outputs, each from the state that the one before handed on."""
     state, found = graph.start(), []
-    for marks in landmarks:
+    for marks, sure in zip(landmarks, torch.ones(landmarks.shape[:2]) if trust is None else trust, strict=True):
         with torch.no_grad():
-            outputs = dict(zip(graph.outputs, graph(marks, torch.ones(68), *state), strict=True))
+            outputs = dict(zip(graph.outputs, graph(marks, sure, *state), strict=True))
         state = tuple(outputs[name] for name in graph.state)
         found.append(outputs)
     return found
@@ -139,6 +139,19 @@ def test_the_file_is_the_graph(written: VideoReport) -> None:
     assert written.size == written.path.stat().st_size
     assert list(written.path.parent.iterdir()) == [written.path]
     assert "against the exact solve over 40 frames" in str(written)
+
+
+def test_landmarks_that_are_not_trusted_are_no_face(rig: BlendshapeRig, takes: list[Tensor]) -> None:
+    """A filter carries them on after a face was lost; nor does a first frame of such landmarks hand on a state."""
+    solver = VideoSolver(rig, None, K, ShapePrior.fit(takes, SEEN), settings=VideoSettings(motion=0.3, tolerance=1e-8))
+    _, landmarks = synthetic_landmarks(solver, 8)
+    sure = torch.ones(8, 68)
+    sure[0], sure[4:6] = 0.0, torch.tensor([[0.0], [torch.nan]])
+    found = played(VideoGraph(solver), landmarks, sure)
+    states, _ = solver.states(landmarks[1:], confidence=sure[1:].nan_to_num(0.0))
+    assert not found[0]["weights"].any()
+    for frame, state in zip(found[1:], states, strict=True):
+        torch.testing.assert_close(frame["weights"].double(), state.weights, atol=1e-4, rtol=0)
 
 
 def corrective_rig(rig: BlendshapeRig) -> BlendshapeRig:

@@ -131,7 +131,7 @@ class VideoGraph(nn.Module):
                 f"{len(previous)} parts of a state, expected ({LANDMARKS},2), ({LANDMARKS},) and {len(self.state)}"
             )
         state = {name: value.double() for name, value in zip(self.state, previous, strict=True)}
-        unseen = torch.isnan(landmarks).any(1)
+        unseen = torch.isnan(landmarks).any(1) | ~(confidence > 0)
         pixels = torch.where(unseen[:, None], 0.0, landmarks.double())
         trust = torch.where(unseen, 0.0, self.landmark_weights * confidence.double())
         enough = (~unseen).double().sum() > _MIN_LANDMARKS - 0.5
@@ -142,7 +142,7 @@ class VideoGraph(nn.Module):
         window = state["weights"][None] if self.dynamics is None else state["window"]
         weights = one_side(torch.where(first, 0.0, window[-1]).clamp(0, 1)[None], self.step.solver.signed)
         head = HeadState(weights, rotation[None], translation[None])
-        counts = torch.where(enough, (~unseen).double() * confidence.double(), 0.0)[None]
+        counts = torch.where(enough & ~unseen, confidence.double(), 0.0)[None]
         evidence = relative_trust(counts) @ self.influence
         interval = self.settings.interval
         before = torch.where(first, 0.0, state["hidden"])[None] if self.walks else torch.zeros_like(evidence)
