@@ -112,6 +112,18 @@ def test_a_second_camera_shows_what_the_first_does_not_see(
     assert float(both[4:7].mean()) < 0.12
 
 
+def test_where_cameras_lie_otherwise_the_result_asks_for_their_file(
+    films: Path, planted: dict[str, Tensor], tmp_path: Path
+) -> None:
+    """OpenCV's place, taken the other way round."""
+    right = replace(cameras(0.06)[1], rotation=TURN.T.contiguous(), translation=-TURN.T @ PLACE)
+    save_cameras([cameras(None)[0], right], tmp_path / "turned.toml")
+    settings = replace(of(films), cameras=tmp_path / "turned.toml")
+    done = track_video.track_video(films / "left.avi", films / "rig.glb", tmp_path / "out", settings)
+    assert done.verdict().startswith("result: poor")
+    assert "do the cameras lie as turned.toml says" in done.verdict()
+
+
 def test_the_command_line_takes_a_film_of_each_camera(
     films: Path, planted: dict[str, Tensor], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -187,8 +187,11 @@ class Tracked:
             return f"result: none, {found}"
         fit = f"the solved face lies {100 * misfit:.1f} % of the eyes' distance from the landmarks"
         if misfit > _POOR:
+            cameras = self.inputs.settings.cameras
             whose = (
-                "is the rig this person's own? If not: track without --rig, then torchface retarget"
+                f"is the rig this person's own, and do the cameras lie as {cameras.name} says, in its order?"
+                if cameras is not None
+                else "is the rig this person's own? If not: track without --rig, then torchface retarget"
                 if self.head is None
                 else "does --rig with their own, or a model of people, do better?"
             )
