@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.color_space import to_linear, to_srgb
 from torchface.errors import ShapeError, TopologyError
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import vertex_normals
@@ -36,13 +37,13 @@ class Lighting:
     """
 
     lights: tuple[tuple[tuple[float, float, float], float], ...] = (
-        ((-0.55, 0.60, 0.60), 0.70),
-        ((0.80, 0.10, 0.50), 0.22),
-        ((0.30, 0.60, -0.75), 0.25),
+        ((-0.55, 0.60, 0.60), 0.85),
+        ((0.80, 0.10, 0.50), 0.12),
+        ((0.30, 0.60, -0.75), 0.20),
     )
-    ambient: float = 0.38
+    ambient: float = 0.18
     occlusion_rays: int = 8
-    gloss: float = 0.10
+    gloss: float = 0.05
 
 
 DEFAULT_LIGHTING = Lighting()
@@ -169,7 +170,8 @@ def _shade(
         light = light + strength * ((cosine + 0.15) / 1.15).clamp(min=0)
         half = torch.nn.functional.normalize(toward - ways, dim=-1)
         highlight = highlight + strength * (normals * half).sum(-1).clamp(min=0) ** 30
-    return (albedo * light[:, None] + lighting.gloss * highlight[:, None]).float()
+    lit = to_linear(albedo).double() * light[:, None] + lighting.gloss * highlight[:, None]
+    return to_srgb(lit.clamp(0, 1)).float()
 
 
 def vertex_openness(mesh: Mesh) -> Tensor:

@@ -18,7 +18,7 @@ from torchface.synthetic import neutral_head
 from train.rendered_people.complexion import complexion_colors, draw_complexions
 
 EVEN = Lighting(lights=(), ambient=1.0, occlusion_rays=0, gloss=0.0)
-LAMP = Lighting(lights=(((0.5, 0.3, 0.8), 0.6),), ambient=0.5, occlusion_rays=0, gloss=0.0)
+LAMP = Lighting(lights=(((0.5, 0.3, 0.8), 0.95),), ambient=0.22, occlusion_rays=0, gloss=0.0)
 CASTS = (torch.tensor([1.1, 1.0, 0.85]), torch.ones(3), torch.tensor([0.85, 0.95, 1.1]))
 GREEN = (0.2, 0.6, 0.2)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.color_space import to_linear, to_srgb
 from torchface.errors import AlignmentError, ShapeError, TopologyError
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.mesh import Mesh
@@ -19,6 +20,7 @@ _SQUARELY = 0.2  # cosine; what is seen more obliquely is blurred and mixed with
 _MIN_ERROR = 0.01  # of full white: below it the colour error counts squared, so that it has a derivative
 _MIN_VERTICES = 50
 _LIGHT_PRIOR = 1.0
+_BLACK, _DARK = 0.01, 0.1  # what has no shade that can be divided out, and what counts no more for being darker
 _MAX_ITERATIONS, _DONE = 30, 1e-5
 
 
@@ -29,8 +31,8 @@ class ColorFit:
     Args:
         coefficients: (L,), standard deviations.
         colors: of the vertices under even light, (V,3) in [0,1].
-        light: of each photograph's channels: ambient, then along x, y, z of the normal, (I,3,4); even light of
-            strength 1 is (1,0,0,0).
+        light: of each photograph's channels, linear: ambient, then along x, y, z of the normal, (I,3,4); even light
+            of strength 1 is (1,0,0,0).
         error: mean Euclidean colour distance at visible vertices, (I,).
     """
 
@@ -50,12 +52,12 @@ def fit_colors(
 ) -> ColorFit:
     r"""The coefficients of a colour model under which a head resembles its photographs.
 
-    .. math:: E_T = \frac1n \sum_v \lVert L_i(n_v)\, C_v(b) - c_{iv} \rVert, \quad |b| \le 3
+    .. math:: E_T = \frac1n \sum_v \lVert g(L_i(n_v)\, g^{-1}(C_v(b))) - c_{iv} \rVert, \quad |b| \le 3
 
-    over the vertices that each photograph shows: distances, not their squares, so that a highlight, a strand of hair
-    or a shadow counts little. Solved by reweighted least squares, each step a quadratic program in a box. The light L
-    is the thesis's missing part: per channel an ambient and a directed share; without it photographs must be lit
-    evenly.
+    with g from linear light to sRGB, over the vertices that each photograph shows: distances, not their squares, so
+    that a highlight, a strand of hair or a shadow counts little. Solved by reweighted least squares, each step a
+    quadratic program in a box. The light L is the thesis's missing part: per channel an ambient and a directed share;
+    without it photographs must be lit evenly.
 
     Args:
         model: of vertex colours.
@@ -101,11 +103,11 @@ def fit_colors(
         H, f, total = _STRENGTH * torch.eye(len(modes), dtype=torch.float64), torch.zeros_like(coefficients), 0.0
         for i, view in enumerate(views):  # photographs: each shows other vertices
             albedo = mean[view.ids] + torch.einsum("l,lvc->vc", coefficients, modes[:, view.ids])
-            shade = view.basis @ light[i].T
-            weight = view.share / (albedo * shade - view.colors).norm(dim=-1).clamp(min=_MIN_ERROR)
+            weight = view.share / (view.lit(albedo, light[i]) - view.colors).norm(dim=-1).clamp(min=_MIN_ERROR)
             if lighting:
                 light[i] = _light(albedo, view, weight)
-                shade = view.basis @ light[i].T
+            albedo = albedo.clamp(min=_BLACK)
+            shade = view.lit(albedo, light[i]) / albedo
             A = (modes[:, view.ids] * shade).flatten(1)
             b = (mean[view.ids] * shade - view.colors).flatten()
             w = weight.repeat_interleave(3)
@@ -118,7 +120,7 @@ def fit_colors(
         before = energy
     colors = mean + torch.einsum("l,lvc->vc", coefficients, modes)
     errors = [
-        (view.share * (colors[view.ids] * (view.basis @ lit.T) - view.colors).norm(dim=-1)).sum() / view.share.sum()
+        (view.share * (view.lit(colors[view.ids], lit) - view.colors).norm(dim=-1)).sum() / view.share.sum()
         for view, lit in zip(views, light, strict=True)
     ]
     return ColorFit(coefficients.float(), colors.clamp(0, 1).float(), light.float(), torch.stack(errors).float())
@@ -132,6 +134,10 @@ class _View:
     colors: Tensor
     basis: Tensor
     share: Tensor
+
+    def lit(self, albedo: Tensor, light: Tensor) -> Tensor:
+        """What the photograph shows of an albedo (Q,3) in light (3,4), both as ``ColorFit`` has them."""
+        return to_srgb(to_linear(albedo) * (self.basis @ light.T).clamp(min=0))
 
 
 def _shown_vertices(
@@ -153,9 +159,11 @@ def _shown_vertices(
 
 def _light(albedo: Tensor, view: _View, weight: Tensor) -> Tensor:
     """Of each channel, (3,4), by weighted least squares; held a little to even light of strength 1."""
-    X = albedo.T[:, :, None] * view.basis
-    H = torch.einsum("q,cqi,cqj->cij", weight, X, X)
-    g = torch.einsum("q,cqi,qc->ci", weight, X, view.colors)
+    X = to_linear(albedo.clamp(0, 1)).T[:, :, None] * view.basis
+    seen = view.colors.clamp(min=_DARK)
+    weight = weight * (seen / to_linear(seen)).square().T  # as errors count in sRGB
+    H = torch.einsum("cq,cqi,cqj->cij", weight, X, X)
+    g = torch.einsum("cq,cqi,qc->ci", weight, X, to_linear(view.colors))
     even = torch.zeros(4, dtype=torch.float64)
     even[0] = 1.0
     return torch.linalg.solve(H + _LIGHT_PRIOR * torch.eye(4, dtype=torch.float64), g + _LIGHT_PRIOR * even)

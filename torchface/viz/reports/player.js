@@ -169,22 +169,22 @@ window.torchfacePlayer = (id, data) => {
        float w = 1.0 - p.z / distance;
        gl_Position = vec4(p.xy * scale, -p.z / 1000.0 * w, w);
      }`,
-    // The lights of torchface.rendering.shading: key, fill and rim, fixed to the camera, wrapped past the terminator.
+    // The lights of clay_shading.Lighting, in linear light as there: key, fill and rim, fixed to the camera.
     `uniform sampler2D image; uniform float textured;
      in vec3 n; in vec2 st; in vec4 tint; in float free; out vec4 pixel;
      void main() {
        vec3 normal = normalize(n);
        if (!gl_FrontFacing) normal = -normal;
        vec3 albedo = tint.a > 0.5 || textured < 0.5 ? tint.rgb : texture(image, st).rgb;
-       float light = 0.38 * free, gloss = 0.0;
+       float light = 0.18 * free, gloss = 0.0;
        vec3 ways[3] = vec3[3](vec3(-0.55, 0.60, 0.60), vec3(0.80, 0.10, 0.50), vec3(0.30, 0.60, -0.75));
-       float strengths[3] = float[3](0.70, 0.22, 0.25);
+       float strengths[3] = float[3](0.85, 0.12, 0.20);
        for (int i = 0; i < 3; i++) {
          vec3 way = normalize(ways[i]);
          light += strengths[i] * max((dot(normal, way) + 0.15) / 1.15, 0.0) * mix(0.35, 1.0, free);
          gloss += strengths[i] * pow(max(dot(normal, normalize(way + vec3(0, 0, 1))), 0.0), 30.0);
        }
-       pixel = vec4(albedo * light + 0.1 * gloss * free, 1.0);
+       pixel = vec4(pow(pow(albedo, vec3(2.2)) * light + 0.05 * gloss * free, vec3(1.0 / 2.2)), 1.0);
      }`);
   const dots = program(
     `uniform mat3 turn; uniform vec3 centre; uniform vec2 scale; uniform float size, distance;
