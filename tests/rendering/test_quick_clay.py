@@ -7,7 +7,7 @@ import torch
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.mesh import Mesh
 from torchface.rendering.quick_clay import QuickClay
-from torchface.synthetic import performer
+from torchface.synthetic import Look, character, performer
 
 BLUE = torch.tensor([0.1, 0.2, 0.8])
 
@@ -23,6 +23,19 @@ def test_lips_are_drawn_in_the_texture() -> None:
     assert blue > 2 * red
     red, _, blue = QuickClay.of(painted).draw(head.vertices, camera)[160, 160].tolist()  # clay
     assert red > blue
+
+
+def test_irises_have_the_colour_of_a_texture_that_shows_some() -> None:
+    head = performer(texture=False).neutral
+    intrinsics = torch.tensor([[3000.0, 0, 160], [0, 3000, 160], [0, 0, 1]]).double()
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    eye = head.vertices[head.landmarks[36:42]].mean(0).double()
+    camera = Camera(intrinsics, flip, torch.tensor([0.0, 0, 400]).double() - flip @ eye, 320, 320)
+    for look in (Look(iris=(0.2, 0.3, 0.6)), Look(iris=(0.4, 0.25, 0.1))):
+        shown = character(look=look, size=512).rig.neutral
+        drawn = QuickClay.of(shown, skin=True).draw(shown.vertices, camera).astype(float)
+        ring = drawn[[160, 160, 160], [142, 178, 182]].mean(0)  # between pupil and white
+        assert (ring[2] > 1.2 * ring[0]) == (look.iris[2] > look.iris[0])
 
 
 def test_what_lies_within_keeps_light_for_when_it_is_seen() -> None:

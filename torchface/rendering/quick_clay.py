@@ -11,6 +11,7 @@ from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.operators import components, vertex_normals
 from torchface.geometry.meshes.rasterization import DrawnPixels, rasterise
 from torchface.mesh import Mesh
+from torchface.part_materials import EYEBALL, IRIS
 from torchface.rendering.clay_shading import vertex_openness
 from torchface.rendering.part_colors import CLAY, clear_triangles, triangle_colors
 
@@ -18,16 +19,18 @@ BACKGROUND = (38, 40, 44)
 _TINT = (236, 92, 40)
 _LIPS = (0.77, 0.52, 0.47)
 _LEVELS, _TINT_LEVELS = 256, 4
-_AMBIENT, _HIGHLIGHT = 0.38, 0.16
+_AMBIENT, _HIGHLIGHT = 0.16, 0.08
 # Right, up, toward the viewer; strength. Light from steeply above blackens the lids of eyes that lie deep.
-_LIGHTS = (((-0.45, 0.40, 0.80), 0.52), ((0.70, 0.05, 0.60), 0.24))
+_LIGHTS = (((-0.45, 0.40, 0.80), 0.78), ((0.70, 0.05, 0.60), 0.18))
 _IN_CREASES = 0.6  # of the lights' strength, where nothing of the sky is seen
 _LEAST_OPEN = 0.6
 _IN_MOUTH = ("mouth_interior", "teeth", "gums", "tongue")
 _IBUG, _INNER_LIPS = 68, [62, 66]
 # Of teeth behind shut lips, which would flicker in the gap, and millimetres between lips that let all light in.
 _BEHIND_LIPS, _LIPS_APART = 0.1, 4.0
-_EXPOSURE = 1.25  # of skin in these lights
+_EXPOSURE = 1.05  # of skin in these lights
+_GAMMA = 2.2  # sRGB, nearly
+_DARKER = 0.85  # irises beside the whites of eyes
 _SMALLEST = 1.0  # millimetres before the lens
 _JUMP = 0.012  # of the nearness; neighbours that differ by more are an edge
 
@@ -52,6 +55,8 @@ class QuickClay:
         faces, drawn = mesh.faces.cpu(), ~clear_triangles(mesh)
         colors, paint = triangle_colors(mesh), _paint(mesh, drawn) if skin else None
         painted = paint is not None
+        if paint is not None:
+            colors[drawn] = _with_iris(colors[drawn], *paint)
         for name, mask in ({} if mesh.annotations is None else mesh.annotations.regions).items():
             if name in {"upper_lip", "lower_lip"} and not painted:  # a texture shows them
                 colors[mask.cpu()[faces].all(1)] = torch.tensor(_LIPS)
@@ -105,7 +110,7 @@ class QuickClay:
         colors[mine.numpy()] = _words((_EXPOSURE * light[mine, None] * texels).clamp(0, 255).byte().numpy())
 
     def _light(self, points: Tensor) -> Tensor:
-        """The light on vertices (V,3) in the camera's frame, (V,), 1 at most but in highlights."""
+        """What the light on vertices (V,3) in the camera's frame multiplies sRGB colours by, (V,)."""
         normals = vertex_normals(points, self.faces)
         light, reached = _AMBIENT * self.openness, _IN_CREASES + (1 - _IN_CREASES) * self.openness
         for (x, y, z), strength in _LIGHTS:
@@ -114,7 +119,7 @@ class QuickClay:
             light = light + strength * ((facing + 0.15) / 1.15).clamp(min=0) * reached
             half = torch.nn.functional.normalize(toward + points.new_tensor([0.0, 0.0, -1.0]), dim=0)
             light = light + _HIGHLIGHT * strength * (normals @ half).clamp(min=0) ** 24
-        return light
+        return light ** (1 / _GAMMA)
 
 
 def _mouth(mesh: Mesh) -> tuple[Tensor, Tensor] | None:
@@ -135,6 +140,17 @@ def _paint(mesh: Mesh, drawn: Tensor) -> tuple[Tensor, Tensor] | None:
     uvs = mesh.uvs.cpu().float()
     places = torch.stack([uvs[:, 0], 1 - uvs[:, 1]], 1) * size - 0.5
     return texture, places[mesh.uv_faces.cpu()[drawn]]
+
+
+def _with_iris(colors: Tensor, texture: Tensor, places: Tensor) -> Tensor:
+    """Colours (F,3) of triangles with irises as the texture has them, where it has some, at places (F,3,2)."""
+    size = torch.tensor([texture.shape[1], texture.shape[0]])
+    column, row = places.mean(1).round().long().clamp(torch.zeros_like(size), size - 1).unbind(1)
+    own = texture[row, column] / 255
+    iris, white = ((colors == torch.tensor(part.color)).all(1) for part in (IRIS, EYEBALL))
+    if bool(iris.any() and white.any()) and own[iris].mean() < _DARKER * own[white].mean():
+        colors = torch.where(iris[:, None], own[iris].median(0).values, colors)
+    return colors
 
 
 def _lit_colors(palette: np.ndarray) -> np.ndarray:
