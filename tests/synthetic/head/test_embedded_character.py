@@ -129,6 +129,20 @@ def test_locks_lie_on_the_head_and_reach_as_far_as_the_haircut(haircut, lowest) 
     assert not face.any()
 
 
+def test_a_fringe_covers_the_forehead_and_no_eye() -> None:
+    bare, whole = (hair_locks("long", fringe).part.vertices for fringe in (False, True))
+    fringe = whole[len(bare) :]
+    assert signed_distance(fringe).min() > -2.5
+    assert 20 < float(fringe[:, 1].min()) < 46  # the middle of brows lies at 21, lids at 6, hair begins at 60
+    low = fringe[fringe[:, 1] < 50]
+    assert float(low[:, 2].min()) > 40  # before the forehead
+    assert float(low[:, 0].min()) < -30
+    assert float(low[:, 0].max()) > 30
+    assert len(character(look=Look(haircut="long", fringe=True), size=64).rig.vertices) == len(
+        character(look=Look(haircut="long"), size=64).rig.vertices
+    ) + len(fringe)
+
+
 def test_haircuts_follow_other_heads(shown) -> None:
     large = torch.zeros(len(IDENTITY))
     large[[parameter.name for parameter in IDENTITY].index("head_width")] = 3.0

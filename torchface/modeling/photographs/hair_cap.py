@@ -27,10 +27,12 @@ _DEEP, _SHARPLY = 5.0, 2  # pixels of the crop within hair, and the power with w
 _WHITE, _UNSURE = 0.1, 0.1  # of its brightness, by which the channels of white hair differ at most; its share
 _LEAST, _SHARE = 20, 0.3
 _EXTREME = 0.2  # share of hair in highlights, and in the deepest shade
+_DYED = 0.2  # of full white, between the channels of dyed hair
 _BEYOND, _MIDDLE = 0.2, 0.35  # share of hair in a picture above the brows, there about the face's middle
 # Of full white; shares: of hair in wide patches (leaves 0.53, hair at least 0.70), of what is green beside them.
 _GREEN, _PATCHY, _LEAFY = 0.008, 0.62, 0.2
 _COLUMNS, _COLUMN, _FEW = 17, 0.05, 6  # across the forehead, half the width of each, vertices
+_MIDDLE_COLUMNS, _LOW_FRINGE = slice(5, 12), 0.2  # in which a fringe hangs so far below the usual hairline
 _STEP, _REACH = 0.03, 0.3  # over which the slope of the line is taken, and how far the line counts
 # Widths (radians about the crown's axis) and lengths of strands and of locks, the band over which hair grows thin, how
 # uneven its edge is in that, and by how much strands differ in brightness.
@@ -52,6 +54,12 @@ class HairCap:
     line: Tensor  # how high it begins over the face at places from the right temple to the left, (17,)
     places: FacePlaces
     long: bool = False  # whether it hangs down behind the ears
+
+    @property
+    def fringe(self) -> bool:
+        """Whether it hangs over the forehead's middle."""
+        across, line = (one[_MIDDLE_COLUMNS] for one in (_columns(), self.line))
+        return float((_usual_line(across) - line).median()) > _LOW_FRINGE
 
     def share(self, place: Tensor) -> Tensor:
         """How much hair covers points (Q,) at places (Q,3)."""
@@ -137,14 +145,23 @@ def _over_brows(shown: Sequence[Shown], places: Sequence[FacePlaces], hair: Tens
 def _hairline(place: Tensor, covered: Tensor) -> Tensor:
     """Where hair begins in each column of the forehead, (17,): the height that best parts skin below from hair above,
     so that a fringe is hair and no second pair of brows."""
-    across = torch.linspace(-1, 1, _COLUMNS, dtype=torch.float64) * _TEMPLE
-    usual = _HAIRLINE - _FALL * (across / _TEMPLE).square()
+    across = _columns()
     line = torch.stack([
         _line(place[near, 1], covered[near], height)
-        for height, near in zip(usual, (place[:, :1] - across).abs().T < _COLUMN, strict=True)
+        for height, near in zip(_usual_line(across), (place[:, :1] - across).abs().T < _COLUMN, strict=True)
     ])  # fmt: skip
     around = lambda values: torch.cat([values[:1].expand(2), values, values[-1:].expand(2)]).unfold(0, 5, 1)  # noqa: E731
     return around(around(line).median(1).values).mean(1)
+
+
+def _columns() -> Tensor:
+    """Places across the forehead, (17,)."""
+    return torch.linspace(-1, 1, _COLUMNS, dtype=torch.float64) * _TEMPLE
+
+
+def _usual_line(across: Tensor) -> Tensor:
+    """How high hair usually begins there."""
+    return _HAIRLINE - _FALL * (across / _TEMPLE).square()
 
 
 def _hair_color(
@@ -184,7 +201,10 @@ def _hair_color(
     order = color.mean(0).argsort()
     total = weight[order].cumsum(0)
     usual = order[(total > _EXTREME * total[-1]) & (total <= (1 - _EXTREME) * total[-1])]
-    return (color[:, usual] @ weight[usual] / weight[usual].sum()).float()
+    color = (color[:, usual] @ weight[usual] / weight[usual].sum()).float()
+    # Hair that is not dyed is never bluish: the light or the camera is.
+    cast = bool(color[2] > color[0]) and float(color.amax() - color.amin()) < _DYED
+    return color.mean().expand(3) if cast else color
 
 
 def _white_hair(shown: FaceParts, crop: Tensor, head: Tensor) -> Tensor:

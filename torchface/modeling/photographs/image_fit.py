@@ -57,6 +57,7 @@ class ImageFit:
         color: the colour model's fit to the photographs; None without one, or without photographs.
         hair: its colour, (3,); None where photographs show a bald head.
         iris: the irises' colour, (3,); None where no photograph shows it.
+        fringe: whether hair hangs over the forehead.
     """
 
     mesh: Mesh
@@ -71,6 +72,7 @@ class ImageFit:
     color: ColorFit | None = None
     hair: Tensor | None = None
     iris: Tensor | None = None
+    fringe: bool = False
 
     @property
     def errors(self) -> Tensor:
@@ -194,6 +196,7 @@ def with_skin(fit: ImageFit, model: HeadModel, images: Sequence[Tensor], setting
         color=skin.fit,
         hair=skin.hair,
         iris=skin.iris,
+        fringe=skin.fringe,
     )
 
 

@@ -64,13 +64,14 @@ _IRIS_COSINE = 0.9  # of the angle between the eye's axis and the border of an i
 @dataclass(frozen=True, eq=False)
 class Skin:
     """Colours of the vertices (V,3), a texture (3,size,size) where there is a layout, the colour model's answer, the
-    hair's colour (3,) where it is seen, and the irises' (3,) where they are seen."""
+    hair's colour (3,) where it is seen, the irises' (3,) where they are seen, and whether there is a fringe."""
 
     colors: Tensor | None
     texture: Tensor | None
     fit: ColorFit | None
     hair: Tensor | None = None
     iris: Tensor | None = None
+    fringe: bool = False
 
     def on(self, mesh: Mesh) -> Mesh:
         """A mesh with it; one without a layout or a colour model keeps its own."""
@@ -160,7 +161,8 @@ def photographed_skin(
         colored = with_part_colors(replace(rest, colors=colors), painted)
         colors = colors if colored.colors is None else colored.colors
         texture = _with_parts(texture, colors, rest, others, painted) if own else texture
-    return Skin(colors, texture.image, fit, None if cap is None else cap.color, iris)
+    of_hair, fringe = (None, False) if cap is None else (cap.color, cap.fringe)
+    return Skin(colors, texture.image, fit, of_hair, iris, fringe)
 
 
 def without_colors(images: Sequence[Tensor]) -> bool:

@@ -82,7 +82,7 @@ def character(
     look = look or Look()
     grown = {"lash_hair": lashes()} | ({"brow_hair": brow_hairs()} if skin is None else {})
     if look.haircut is not None:
-        grown = {"hair": scalp_hair(_CAP[look.haircut]), "hair_locks": hair_locks(look.haircut), **grown}
+        grown = {"hair": scalp_hair(_CAP[look.haircut]), "hair_locks": hair_locks(look.haircut, look.fringe), **grown}
     for name, piece in grown.items():
         parts[name] = piece.part
         pieces[name] = _grown(piece, rest, moved)

@@ -23,17 +23,29 @@ LOCK_PATCH = (0.577, 0.785, 0.612, 0.985)
 """Place on the page that locks are coloured from: across them, and from root to tip."""
 KNOT = (0.0, 46.0, -104.0)  # where tied hair is held together
 _KNOT_RADIUS = 21.0
-_PARTING = {"short": 24.0, "long": 7.0, "tied": 0.0}
-_ROWS = {"short": 7, "long": 12, "tied": 9}
-_SPACING = {"short": 8.2, "long": 9.0, "tied": 9.0}
-_LOOSE = {"short": 0.13, "long": 0.035, "tied": 0.04}
+_FRINGE = 38.0  # how high a fringe ends, millimetres
+_PARTING = {"short": 24.0, "long": 7.0, "tied": 0.0, "fringe": 12.0}
+_ROWS = {"short": 7, "long": 12, "tied": 9, "fringe": 8}
+_SPACING = {"short": 7.0, "long": 9.0, "tied": 9.0, "fringe": 5.0}
+_LOOSE = {"short": 0.07, "long": 0.035, "tied": 0.04, "fringe": 0.05}
 _EAR = ((76.0, -12.0, -13.0), (11.0, 36.0, 25.0))  # centre and radii of what hair passes over
 
 
-@lru_cache(maxsize=3)
-def hair_locks(style: Style) -> GrownPart:
-    """All locks of a haircut."""
-    roots, normals, hosts, weights = _roots(style)
+@lru_cache(maxsize=6)
+def hair_locks(style: Style, fringe: bool = False) -> GrownPart:
+    """All locks of a haircut, with a fringe down to the brows if asked for."""
+    whole = _grown(style, *_roots(style))
+    if not fringe:
+        return whole
+    front = _grown("fringe", *_roots("fringe"))
+    return GrownPart(
+        HeadPart.joined([whole.part, front.part]),
+        torch.cat([whole.hosts, front.hosts]),
+        torch.cat([whole.weights, front.weights]),
+    )
+
+
+def _grown(style: str, roots: Tensor, normals: Tensor, hosts: Tensor, weights: Tensor) -> GrownPart:
     random = np.random.default_rng(9)
     rows, count = _ROWS[style], len(roots)
     jitter = torch.from_numpy(random.normal(0, 1, (count, 3)))
@@ -74,7 +86,7 @@ def hair_locks(style: Style) -> GrownPart:
     return GrownPart(part, hosts, weights)
 
 
-def _roots(style: Style) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _roots(style: str) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Places on the scalp about evenly far from each other: points, normals, hosts and weights."""
     t, v = topology(), sculpted_vertices()
     faces = fan_triangulation(t.quads)
@@ -93,7 +105,9 @@ def _roots(style: Style) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     # Closer along the hairline, where single locks are seen.
     radius = (_SPACING[style] * (0.62 + 0.38 * ramp(share, 0.05, 0.6))).numpy()
     tree, alive = cKDTree(points.numpy()), (share > 0.03).numpy()
-    if style == "short":  # sides and back are cropped: the cap shows them, locks break its edge
+    if style == "fringe":
+        alive &= ((points[:, 2] > 30) & (points[:, 0].abs() < 48) & (share > 0.15)).numpy()
+    elif style == "short":  # sides and back are cropped: the cap shows them, locks break its edge
         alive &= ((_top(points) > 0.1) | ((share < 0.3) & (points[:, 1] > 42))).numpy()
     kept = []
     for i in range(len(points)):  # one by one: each that is kept keeps others away
@@ -116,18 +130,20 @@ def _top(roots: Tensor) -> Tensor:
     return ramp(roots[:, 1] + 26 * ramp(roots[:, 2], 20, 56) - 0.35 * (roots[:, 0].abs() - 34).clamp(min=0), 58, 80)
 
 
-def _to_parting(style: Style, points: Tensor) -> Tensor:
+def _to_parting(style: str, points: Tensor) -> Tensor:
     """To which side of the parting points lie, about -1 or 1, (N,)."""
     return torch.tanh((points[:, 0] - _PARTING[style]) / 2.0)
 
 
-def _way(style: Style, points: Tensor, up: Tensor, roots: Tensor, along: float) -> Tensor:
+def _way(style: str, points: Tensor, up: Tensor, roots: Tensor, along: float) -> Tensor:
     """Where hair goes on from points (N,3), (N,3)."""
     y, z = points[:, 1], points[:, 2]
     side = _to_parting(style, roots)
     one = torch.ones_like(y)
     if style == "tied":
         return torch.nn.functional.normalize(torch.tensor(KNOT).double() - points, dim=1)
+    if style == "fringe":
+        return torch.stack([0.12 * side + roots[:, 0] / 160, -one, 0.9 * ramp(y, 50, 80)], 1)
     if style == "long":
         front = ramp(z, 2, 34)
         over = torch.stack([side, 0.1 * one, -0.35 - 1.3 * front], 1)
@@ -143,14 +159,14 @@ def _way(style: Style, points: Tensor, up: Tensor, roots: Tensor, along: float) 
     return sweep * top + down * (1 - top)
 
 
-def _hugging(style: Style, points: Tensor) -> Tensor:
+def _hugging(style: str, points: Tensor) -> Tensor:
     """How far hair keeps to the head's form, (N,1): long hair hangs where the head recedes."""
     if style != "long":
         return torch.ones(len(points), 1, dtype=points.dtype)
     return ramp(points[:, 1], -10, 50)[:, None]
 
 
-def _held(style: Style, points: Tensor, height: Tensor) -> Tensor:
+def _held(style: str, points: Tensor, height: Tensor) -> Tensor:
     """Points moved to their height over the head; long hair that hangs is kept out of it alone."""
     off = height - signed_distance(points)
     if style == "long":
@@ -166,36 +182,40 @@ def _held(style: Style, points: Tensor, height: Tensor) -> Tensor:
     return points
 
 
-def _length(style: Style, roots: Tensor) -> Tensor:
+def _length(style: str, roots: Tensor) -> Tensor:
     """Millimetres of each lock."""
     y, z = roots[:, 1], roots[:, 2]
     if style == "tied":
         return 1.12 * (torch.tensor(KNOT).double() - roots).norm(dim=1) + 4
+    if style == "fringe":
+        return (y - _FRINGE).clamp(min=10) * 1.25
     if style == "long":
         return (y + 170).clamp(min=60) * 1.02 + 55 * ramp(y, 40, 95)
-    return 11 + 41 * _top(roots) * (1 + 0.15 * ramp(z, 20, 60))
+    return 12 + 50 * _top(roots) * (1 + 0.15 * ramp(z, 20, 60))
 
 
-def _heights(style: Style, roots: Tensor, rows: int) -> Tensor:
+def _heights(style: str, roots: Tensor, rows: int) -> Tensor:
     """Millimetres over the head along each lock, (N,rows)."""
     z, share = roots[:, 2], ramp(hair_share(roots), 0.0, 0.7)
     along = torch.linspace(0, 1, rows, dtype=torch.float64)
     swell = torch.sin(np.pi * along.clamp(0, 1) ** 0.7)
     if style == "tied":
         return (3.2 + 2.6 * share)[:, None] * (0.6 + 0.4 * swell) + 2.0 * along
+    if style == "fringe":
+        return (2.5 + 6.0 * share)[:, None] * (0.4 + 0.6 * swell) + 2.0
     if style == "long":
-        return 3.0 + (3.0 + 4.5 * share)[:, None] * (0.5 + 0.5 * along.clamp(max=0.3) / 0.3)
-    full = 1.6 + 1.0 * share + _top(roots) * (8.0 + 6.5 * ramp(z, 15, 62))
-    return full[:, None] * (0.45 + 0.55 * swell) + 0.4
+        return 2.0 + (4.0 + 11.0 * share)[:, None] * (0.3 + 0.7 * along.clamp(max=0.25) / 0.25)
+    full = 1.6 + 1.0 * share + _top(roots) * (8.0 + 6.5 * ramp(z, 15, 62)) * (0.45 + 0.55 * share)
+    return full[:, None] * (0.2 + 0.8 * swell) + 0.4
 
 
-def _widths(style: Style, roots: Tensor, rows: int) -> Tensor:
+def _widths(style: str, roots: Tensor, rows: int) -> Tensor:
     """Millimetres across each lock, (N,rows), to a point."""
     along = torch.linspace(0, 1, rows, dtype=torch.float64)
-    taper = (1 - along**3.2) * (0.55 + 0.45 * (along / 0.3).clamp(max=1))
+    taper = (1 - along ** (2.0 if style == "short" else 5.0)) * (0.55 + 0.45 * (along / 0.3).clamp(max=1))
     share = ramp(hair_share(roots), 0.02, 0.45)
-    wide = {"short": 2.6 + 10.0 * _top(roots), "long": torch.full_like(share, 12.0),
-            "tied": torch.full_like(share, 10.0)}[style]  # fmt: skip
+    wide = {"short": 2.6 + 8.0 * _top(roots), "long": torch.full_like(share, 13.0),
+            "tied": torch.full_like(share, 10.0), "fringe": torch.full_like(share, 9.0)}[style]  # fmt: skip
     return (wide * (0.45 + 0.55 * share))[:, None] * taper.clamp(min=0.03)
 
 

@@ -46,6 +46,7 @@ class Look:
         teeth, whites: how bright teeth and the whites of the eyes are, 1 as usual.
         iris_size: how wide irises are on their eyeballs, 1 as usual.
         haircut: "short", "long" to the shoulders, or "tied" at the back; bald if absent.
+        fringe: whether hair hangs over the forehead, down to the brows.
 
     Example:
         >>> Look(age=70.0, hair=(0.6, 0.6, 0.6)).melanin
@@ -59,6 +60,7 @@ class Look:
     lips: float = 1.0
     freckles: float = 1.0
     haircut: Style | None = "short"
+    fringe: bool = False
     shirt: tuple[float, float, float] = (0.23, 0.28, 0.34)
     teeth: float = 1.0
     whites: float = 1.0

@@ -63,6 +63,7 @@ def dressed_rig(
         hair=usual.hair if fit.hair is None else _color(fit.hair),
         iris=usual.iris if fit.iris is None else _color(fit.iris),
         haircut=None if fit.hair is None else "long" if hangs_down(parts, marks) else "short",
+        fringe=fit.fringe,
         shirt=usual.shirt if shirt is None else _color(shirt),
         iris_size=iris_size(neutral),
         **_brightness(images, parts),
