@@ -182,11 +182,12 @@ def eye_color(
     color = color * (1 - 0.30 * ramp(way[:, 1], 0.12, 0.42))[:, None]  # the upper lid's shade
     polar = polar / iris_size
     spokes = torch.stack([angle.cos() * 9, angle.sin() * 9, polar * 2.5], dim=1)
-    iris = torch.tensor(brown) * (1 + 0.45 * noise(spokes, 1.0, 8))[:, None]
-    light = torch.tensor(brown) * 1.35 + 0.05
+    varied = 1.1 - sum(brown) / 3  # light irises are more even
+    iris = torch.tensor(brown) * (1 + 0.45 * varied * noise(spokes, 1.0, 8))[:, None]
+    light = torch.tensor(brown) * (1 + 0.35 * varied) + 0.03
     iris = iris + (light - iris) * (1 - ramp(polar, 0.17, 0.34))[:, None]
     caustic = ramp(-(way[:, 1] + 0.6 * way[:, 0]), -0.05, 0.35)  # light gathers opposite the highlight
-    iris = iris * (0.8 + 0.75 * caustic)[:, None]
+    iris = iris * (1 + 0.75 * varied * (caustic - 0.4))[:, None]
     iris = mix(iris, (0.07, 0.05, 0.045), 0.9 * ramp(polar, 0.36, 0.44))
     color = color + (iris - color) * (1 - ramp(polar, IRIS_EDGE - 0.025, IRIS_EDGE + 0.025))[:, None]
     color = mix(color, (0.015, 0.012, 0.012), 1 - ramp(polar, 0.165, 0.195))
