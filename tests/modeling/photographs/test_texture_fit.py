@@ -81,6 +81,18 @@ def test_light_and_white_balance_do_not_count_as_skin(
     assert found.light[2, :, 0].argmax() == 2
 
 
+def test_a_black_hat_counts_no_more_than_other_errors(
+    model: MorphableModel, subject: Mesh, cameras: list[Camera], lit: list[Tensor]
+) -> None:
+    """A little light more in black is much in sRGB, and only a little of what a hat differs from skin by."""
+    high = subject.vertices[:, 1] > subject.vertices[subject.landmarks[17:27], 1].max() + 25.0
+    hat = replace(subject, colors=torch.where(high[:, None], 0.03, subject.colors))
+    found = fit_colors(model, hat, [render(hat, cameras[1], lighting=LAMP, background=GREEN, samples=1)], cameras[1:2])
+    bare = fit_colors(model, subject, lit[1:2], cameras[1:2])
+    assert difference(found.colors, bare.colors, subject) < 0.03
+    assert (found.light - bare.light).norm() < 0.1 * bare.light.norm()
+
+
 def test_bounds_hold(model: MorphableModel, subject: Mesh, cameras: list[Camera], lit: list[Tensor]) -> None:
     found = fit_colors(model, subject, lit, cameras, lighting=False, bound=0.5)
     assert float(found.coefficients.abs().max()) == 0.5

@@ -20,7 +20,7 @@ _SQUARELY = 0.2  # cosine; what is seen more obliquely is blurred and mixed with
 _MIN_ERROR = 0.01  # of full white: below it the colour error counts squared, so that it has a derivative
 _MIN_VERTICES = 50
 _LIGHT_PRIOR = 1.0
-_BLACK, _DARK = 0.01, 0.1  # what has no shade that can be divided out, and what counts no more for being darker
+_BLACK = 0.01  # what has no shade that can be divided out, and counts no more for being darker
 _MAX_ITERATIONS, _DONE = 30, 1e-5
 
 
@@ -105,7 +105,7 @@ def fit_colors(
             albedo = mean[view.ids] + torch.einsum("l,lvc->vc", coefficients, modes[:, view.ids])
             weight = view.share / (view.lit(albedo, light[i]) - view.colors).norm(dim=-1).clamp(min=_MIN_ERROR)
             if lighting:
-                light[i] = _light(albedo, view, weight)
+                light[i] = _light(albedo, view, weight, light[i])
             albedo = albedo.clamp(min=_BLACK)
             shade = view.lit(albedo, light[i]) / albedo
             A = (modes[:, view.ids] * shade).flatten(1)
@@ -157,13 +157,16 @@ def _shown_vertices(
     return views
 
 
-def _light(albedo: Tensor, view: _View, weight: Tensor) -> Tensor:
-    """Of each channel, (3,4), by weighted least squares; held a little to even light of strength 1."""
+def _light(albedo: Tensor, view: _View, weight: Tensor, light: Tensor) -> Tensor:
+    """Of each channel, (3,4), by a step of Gauss and Newton from ``light`` on weighted squares of errors in sRGB; held
+    a little to even light of strength 1."""
     X = to_linear(albedo.clamp(0, 1)).T[:, :, None] * view.basis
-    seen = view.colors.clamp(min=_DARK)
-    weight = weight * (seen / to_linear(seen)).square().T  # as errors count in sRGB
+    lit = (X @ light[:, :, None])[..., 0].clamp(min=_BLACK)
+    slope = 1.055 / 2.4 * lit ** (1 / 2.4 - 1)  # of to_srgb
+    goal = lit + (view.colors.T - to_srgb(lit)) / slope
+    weight = weight * slope.square()
     H = torch.einsum("cq,cqi,cqj->cij", weight, X, X)
-    g = torch.einsum("cq,cqi,qc->ci", weight, X, to_linear(view.colors))
+    g = torch.einsum("cq,cqi,cq->ci", weight, X, goal)
     even = torch.zeros(4, dtype=torch.float64)
     even[0] = 1.0
     return torch.linalg.solve(H + _LIGHT_PRIOR * torch.eye(4, dtype=torch.float64), g + _LIGHT_PRIOR * even)
