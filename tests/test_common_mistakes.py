@@ -140,6 +140,8 @@ MISTAKES: dict[str, tuple[Callable[[Given], Any], str]] = {
         lambda g: g.model.project(g.heads[:, :2], vertices=[0.0, 1.0]),
         "vertices: found floats, expected whole numbers",
     ),
+    "a mask of another head": (lambda g: g.model.part([True] * 4), r"vertices: found \(4,\), expected ids \(N,\) or a"),
+    "pairs of ids": (lambda g: g.model.project(g.heads[:, :4], [[0, 1], [2, 3]]), r"vertices: found \(2, 2\), exp"),
     "a vertex of another head": (lambda g: g.model.part([0, 999]), "vertices: found indices 0 to 999, expected 0 to"),
     "samples by the half": (lambda g: g.model.sample(1.5), "count: found 1.5, expected a whole number"),
     "steps by the half": (lambda g: g.model.interpolate([0.0] * 3, [1.0] * 3, 2.5), "steps: found 2.5, expected a wh"),
@@ -281,6 +283,10 @@ def test_arrays_and_lists_give_what_tensors_give(given: Given) -> None:
     assert torch.equal(
         g.model.project(g.heads[:, 2:5], [2, 3, 4]), g.model.project(g.heads[:, 2:5], torch.arange(2, 5))
     )
+    mask = torch.arange(len(g.v)) < 3
+    for chosen in (mask, mask.numpy(), mask.tolist(), [0, 1, 2], np.arange(3, dtype=np.int32)):
+        assert torch.equal(g.model.part(chosen).mean, g.model.mean[:3])
+        assert torch.equal(g.model.project(g.heads[:, :3], chosen), g.model.project(g.heads[:, :3], torch.arange(3)))
     assert torch.equal(g.model.log_prob([[1.0, 2.0, 0.0]]), torch.tensor([-2.5]))
     torch.testing.assert_close(g.regression(g.v[None].numpy()), g.regression(g.v[None]))
 

@@ -175,7 +175,7 @@ class MorphableModel(nn.Module):
 
         Args:
             samples: (B,V,C), or (B,N,C) of the ``vertices``; a vertex with a NaN counts as missing.
-            vertices: ids (N,) int64; all of them if absent.
+            vertices: ids (N,) int64, or a mask (V,); all of them if absent.
             noise: standard deviation in the unit of the samples, a number or one a vertex (N,).
 
         Returns:
@@ -190,7 +190,7 @@ class MorphableModel(nn.Module):
         samples = as_tensor("samples", samples, "(B,V,C)").to(self.mean)
         mean, components = self.mean, self.components
         if vertices is not None:
-            vertices = checked_indices("vertices", vertices, len(mean), ValueRangeError).flatten()
+            vertices = self._chosen(vertices)
             mean, components = mean[vertices], components[:, vertices]
         if samples.ndim != 3 or samples.shape[1:] != mean.shape:
             raise ShapeError(f"samples: found {tuple(samples.shape)}, expected (B,{mean.shape[0]},{mean.shape[1]})")
@@ -257,8 +257,7 @@ class MorphableModel(nn.Module):
     def part(self, vertices: Tensor) -> "MorphableModel":
         """The same distribution seen at some vertices only, ids (N,) or a mask (V,); its components are orthonormal
         there."""
-        if getattr(vertices, "dtype", None) != torch.bool:
-            vertices = checked_indices("vertices", vertices, len(self.mean), ValueRangeError).flatten()
+        vertices = self._chosen(vertices)
         modes = self.modes[:, vertices].double().flatten(1)
         _, deviations, components = torch.linalg.svd(modes, full_matrices=False)
         kept = deviations > 1e-6 * deviations[0].clamp(min=1e-12)
@@ -290,6 +289,15 @@ class MorphableModel(nn.Module):
             0.0,
             values["samples"].whole(0, _MAX_BYTES - 1),
         )
+
+    def _chosen(self, vertices: object) -> Tensor:
+        """Ids (N,) of vertices, given as such or as a mask (V,)."""
+        made = as_tensor("vertices", vertices, "(N,) of ids, or a mask (V,)")
+        if made.shape != (self.mean.shape[:1] if made.dtype == torch.bool else (made.numel(),)):
+            raise ShapeError(f"vertices: found {tuple(made.shape)}, expected ids (N,) or a mask ({len(self.mean)},)")
+        if made.dtype == torch.bool:
+            return made.nonzero()[:, 0]
+        return checked_indices("vertices", vertices, len(self.mean), ValueRangeError)
 
     def _checked(self, coefficients: Tensor | list[Tensor]) -> Tensor:
         coefficients = as_real(coefficients, "coefficients")
