@@ -248,7 +248,10 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
         # still shows of hair.
         edge = graph.smoothed(1 - covered[:, None], torch.ones_like(covered), _FEATHER)[:, 0]
         seen_color = guess / covered.clamp(min=1e-9)[:, None]
-        weight = covered * (edge + 1e-3) * _typical(seen_color, mean)
+        typical = covered * _typical(seen_color, mean)
+        # Far from any edge, as at the neck, the base has the hue that the face has: the light's is known roughly.
+        under = under * _median_ratio(seen_color, under, typical > 0.5)
+        weight = (edge + 1e-3) * typical
         return guess + (1 - covered)[:, None] * _toned(under, seen_color, weight, graph, _FILL)
     label = components(mesh.faces.cpu(), len(alpha))
     shown = torch.zeros(int(label.max()) + 1, dtype=torch.float64).index_add_(0, label, covered)
@@ -270,6 +273,14 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
 def _typical(colors: Tensor, mean: Tensor) -> Tensor:
     """How much colours (V,3) are like a mean, (V,) in [0,1]."""
     return torch.exp(-0.5 * ((colors - mean) / _TYPICAL).square().sum(-1))
+
+
+def _median_ratio(goal: Tensor, colors: Tensor, where: Tensor) -> Tensor:
+    """How much brighter a goal (V,3) is than colours (V,3) where (V,) they are compared, (3,)."""
+    if not bool(where.any()):
+        return torch.ones(3, dtype=colors.dtype)
+    ratio = goal[where].clamp(min=_DARK).log() - colors[where].clamp(min=_DARK).log()
+    return ratio.median(0).values.clamp(-_MAX_TONE, _MAX_TONE).exp()
 
 
 def _toned(
