@@ -286,7 +286,7 @@ class Tracked:
         often = [i for i in bounds.argsort(descending=True).tolist() if bounds[i] > _OFTEN]
         if often:
             named = ", ".join(f"{self.rig.names[i]} {100 * float(bounds[i]):.0f} %" for i in often[:_MAX_NAMED])
-            more = "a rig made by torchface fit with a photograph of this expression among others goes further"
+            more = "a rig made by torchface fit with a photograph of this expression among others can go further"
             if self.head is None:
                 why = f"the rig; {more}. If the rig is another person's: track without --rig, then torchface retarget"
             else:
