@@ -213,6 +213,14 @@ MISTAKES: dict[str, tuple[Callable[[Given], Any], str]] = {
     "a mesh for a take's solver": (lambda g: WholeTakeSolver(g.mesh), "markers: found a Mesh, expected a MarkerSolv"),
     "a path for a webcam": (lambda g: WebcamSolver("a.glb"), "rig: found the text 'a.glb', .*torchface.load_rig reads"),
     "markers for examples": (lambda g: ExampleSolver(g.markers), "examples: found a tensor .* an ExampleShapes"),
+    "a prior for landmarks": (
+        lambda g: VideoSolver(g.rig, g.prior, torch.eye(3)),
+        "landmark_vertices: found a ShapePrior, expec",
+    ),
+    "a text for landmarks' weights": (
+        lambda g: VideoSolver(g.rig, [*range(68)], torch.eye(3), landmark_weights="even"),
+        "landmark_weights: found the text 'even', expected a tensor",
+    ),
     "a focal length alone": (lambda g: VideoSolver(g.rig, g.f[:68, 0], 500.0), "intrinsics: found a float, expected"),
     "weights as a tensor": (lambda g: g.rig.weights_from(g.q), r"track: found a tensor \(4, 3\), expected a Track"),
     "a mesh for vertices": (lambda g: g.mesh.with_vertices(g.mesh), "vertices: found a Mesh, expected a tensor"),

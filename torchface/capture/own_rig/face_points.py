@@ -12,6 +12,7 @@ from torchface.correctives.activation import CorrectiveActivation
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.geometry.cameras.sliding_contour import LevelCurves, level_curves, outermost
 from torchface.geometry.meshes.operators import components
+from torchface.number_checks import as_tensor
 from torchface.rig import BlendshapeRig
 
 LANDMARKS = 68
@@ -41,7 +42,8 @@ class FacePoints:
         """Those of a rig whose landmarks are the vertices (68,), float64; those of the contour slide or stay,
         visible or not."""
         count = len(rig.vertices)
-        marks = landmark_vertices.detach().long().to(rig.vertices.device)
+        marks = as_tensor("landmark_vertices", landmark_vertices, f"({LANDMARKS},)", torch.int64)
+        marks = marks.detach().long().to(rig.vertices.device)
         if marks.shape != (LANDMARKS,):
             raise ShapeError(f"landmark_vertices: found {tuple(marks.shape)}, expected ({LANDMARKS},)")
         if int(marks.min()) < 0 or int(marks.max()) >= count:

@@ -19,7 +19,7 @@ from torchface.correctives.activation import CorrectiveActivation
 from torchface.correctives.corrective_shapes import definitions_from_records
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.documents import Value
-from torchface.number_checks import as_tensor, checked_type
+from torchface.number_checks import as_real, as_tensor, checked_type
 from torchface.rig import BlendshapeRig
 from torchface.shape_names import read_as_arkit
 
@@ -85,7 +85,8 @@ class VideoSolverParts(nn.Module):
         marks = rig.neutral.landmarks if landmark_vertices is None else landmark_vertices
         if intrinsics.shape != (3, 3):
             raise ShapeError(f"intrinsics: found {tuple(intrinsics.shape)}, expected (3,3)")
-        weights = _default_weights() if landmark_weights is None else landmark_weights.detach()
+        weights = _default_weights() if landmark_weights is None else as_real(landmark_weights, "landmark_weights")
+        weights = weights.detach()
         if weights.shape != (LANDMARKS,):
             raise ShapeError(f"landmark_weights: found {tuple(weights.shape)}, expected ({LANDMARKS},)")
         check_not_negative("landmark_weights", weights)
