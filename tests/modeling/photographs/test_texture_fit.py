@@ -192,3 +192,11 @@ def test_hair_and_cloth_are_not_painted_on(subject: Mesh, skins: Tensor, cameras
     outside = (hair | collar)[pairs].any(1)
     jump = (masked.colors[pairs[:, 0]] - masked.colors[pairs[:, 1]]).norm(dim=-1)[outside]
     assert float(jump.quantile(0.99)) < 0.06
+
+
+def test_skin_that_no_photograph_shows_has_the_hue_of_what_one_shows(subject: Mesh, cameras: list[Camera]) -> None:
+    own, other = torch.tensor([0.62, 0.48, 0.36]), torch.tensor([0.32, 0.27, 0.33])
+    shown = replace(subject, colors=own.expand_as(subject.vertices))
+    picture = render(shown, cameras[1], lighting=EVEN, background=GREEN, samples=1)
+    colors = photo_texture(shown, [picture], cameras[1:2], 256, base=other.expand_as(subject.vertices)).colors
+    assert float((colors[subject.vertices[:, 2].argmin()] - own).abs().max()) < 0.02  # the back of the head
