@@ -34,7 +34,7 @@ export class Stage {
     this.#film = film;
     this.#renderer = new THREE.WebGLRenderer({ canvas, antialias: film !== null || !this.#software, alpha: true });
     if (film !== null) this.#scene.background = new THREE.Color(film.background);
-    this.#renderer.toneMapping = THREE.NeutralToneMapping;
+    this.#renderer.toneMapping = THREE.NoToneMapping;
     const key = new THREE.DirectionalLight(0xfff4e8, 2.2), rim = new THREE.DirectionalLight(0xdce8ff, 0.8);
     key.position.set(-0.6, 0.8, 1);
     rim.position.set(0.9, 0.5, -0.6);
