@@ -26,7 +26,7 @@ from torchface.shape_names import read_as_arkit
 CONTOUR_WEIGHT = 0.5
 ROTATION_STEP, TRANSLATION_STEP = 0.02, 4.0
 """How far a head moves from frame to frame: standard deviations in radians and millimetres."""
-_TURN, _SHIFT = 0.6, 120.0
+_TURN, _SHIFT = 0.6, 180.0
 """How far it wanders in a second, where weights walk: landmarks that are left while others are hidden lead no further
 astray."""
 INITIAL_ROTATION, INITIAL_TRANSLATION = 0.5, 500.0

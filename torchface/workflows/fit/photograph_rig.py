@@ -156,7 +156,8 @@ class FittedHead:
         regions = {} if self.rig.neutral.annotations is None else self.rig.neutral.annotations.regions
         seen = "brightness in the photographs, which show no colours" if self.grey else "colour in the photographs"
         if fit.hair is not None:
-            what = "the template's haircut, not the person's" if "hair" in regions else "painted on the head as a cap"
+            cut = "haircut with a fringe" if fit.fringe else "haircut"
+            what = f"the template's {cut}, not the person's" if "hair" in regions else "painted on the head as a cap"
             lines.append(f"hair: {_code(fit.hair)}, its {seen}; {what}")
         elif fit.mesh.texture is not None:
             lines.append("hair: none seen over the brows; the network that looks for it misses grey hair at times")
