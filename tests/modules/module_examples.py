@@ -51,6 +51,9 @@ from torchface.optim import BoxQP, FixedSplitting, ProjectedGradient
 from torchface.synthetic import performer
 
 SOLVER = {"vmap": "batches", "jacrev": "jacobian", "torch.compile": "gap"}
+SOLVER_GRAPH, CORRECTIVE_GRAPH, NOT_EXPORTED, TO_ONNX = (
+    {**SOLVER, "torch.export": cell} for cell in ("SolverGraph", "CorrectiveGraph", "no", "ONNX")
+)
 NAMES = ("jawOpen", "mouthPucker", "mouthSmileLeft", "mouthSmileRight", "browInnerUp", "eyeBlinkLeft")
 CAMERA = torch.tensor([[700.0, 0, 319.5], [0, 700.0, 239.5], [0, 0, 1]], dtype=torch.float64)
 
@@ -175,10 +178,6 @@ def example_shapes(number: int) -> ExampleShapes:
     return ExampleShapes(NAMES[:5], neutral, moved)
 
 
-def example_solver(number: int) -> ExampleSolver:
-    return ExampleSolver(example_shapes(number))
-
-
 def projecting_example_solver(number: int) -> ExampleSolver:
     return ExampleSolver(example_shapes(number), LandmarkModel.fit(example_shapes(number)))
 
@@ -199,9 +198,8 @@ def expression_regression(number: int) -> ExpressionRegression:
     whole = rig(number)
     neutrals = whole(0.3 * random(6, len(NAMES), seed=number).float())
     sizes = 1 + 0.2 * random(6, 1, 1, 1, seed=number).float()
-    return ExpressionRegression.fit(
-        neutrals, neutrals[:, None] + sizes * whole.deltas[:2], ExpressionSettings(3, 3), NAMES[:2]
-    )
+    expressions = neutrals[:, None] + sizes * whole.deltas[:2]
+    return ExpressionRegression.fit(neutrals, expressions, ExpressionSettings(3, 3), NAMES[:2])
 
 
 @cache
@@ -213,10 +211,8 @@ def enhancement_model(number: int) -> EnhancementModel:
     neutral, faces = whole.vertices, whole.neutral.faces
     waves = 0.1 * ((2.1 - number) * neutral[:, 1]).sin() * (smooth - neutral).norm(dim=-1)
     frames = smooth + waves[..., None] * vertex_normals(smooth, faces)
-    sequences = torch.arange(3).repeat_interleave(6)
-    return EnhancementModel.fit(
-        CapturedPerformance(frames, faces, sequences, neutral), rank=6, patch_size=60, region_count=3
-    )
+    performance = CapturedPerformance(frames, faces, torch.arange(3).repeat_interleave(6), neutral)
+    return EnhancementModel.fit(performance, rank=6, patch_size=60, region_count=3)
 
 
 @cache
@@ -324,38 +320,30 @@ EXAMPLES: dict[str, Example] = {
     "ProjectedGradient": Example(
         lambda n: ProjectedGradient(box_qp(n).H, steps=60), lambda: (random(10, 6, seed=3).float() - 1,)
     ),
-    "MarkerSolver": Example(
-        marker_solver, lambda: (seen_markers(rig()),), cells={**SOLVER, "torch.export": "SolverGraph"}
-    ),
+    "MarkerSolver": Example(marker_solver, lambda: (seen_markers(rig()),), cells=SOLVER_GRAPH),
     "MarkerSolver with correctives": Example(
-        corrected_solver, lambda: (seen_markers(corrected_rig()),), cells={**SOLVER, "torch.export": "CorrectiveGraph"}
+        corrected_solver, lambda: (seen_markers(corrected_rig()),), cells=CORRECTIVE_GRAPH
     ),
     "HelmetSolver": Example(
-        lambda n: HelmetSolver(rig(n), sites()), lambda: (seen_markers(rig()),), helmet,
-        {**SOLVER, "torch.export": "no"},
+        lambda n: HelmetSolver(rig(n), sites()), lambda: (seen_markers(rig()),), helmet, NOT_EXPORTED
     ),
-    "HybridSolver": Example(
-        lambda n: HybridSolver(marker_solver(n)), pulled_markers, cells={**SOLVER, "torch.export": "SolverGraph"}
-    ),
+    "HybridSolver": Example(lambda n: HybridSolver(marker_solver(n)), pulled_markers, cells=SOLVER_GRAPH),
     "HybridSolver with correctives": Example(
-        lambda n: HybridSolver(corrected_solver(n)), pulled_markers,
-        cells={**SOLVER, "torch.export": "CorrectiveGraph"},
+        lambda n: HybridSolver(corrected_solver(n)), pulled_markers, cells=CORRECTIVE_GRAPH
     ),
     "WholeTakeSolver": Example(
         lambda n: WholeTakeSolver(marker_solver(n)), lambda: (seen_markers(rig()),),
-        cells={**SOLVER, "gradients": "no", "jacrev": "no", "torch.export": "no"},
+        cells={**NOT_EXPORTED, "gradients": "no", "jacrev": "no"},
     ),
     "VideoSolver": Example(
         video_solver, lambda: (seen_landmarks(),), lambda m, x: list(vars(m(x)).values()),
         {**SOLVER, "torch.export": "VideoGraph"},
     ),
-    "WebcamSolver": Example(
-        webcam_solver, webcam_inputs, cells={"gradients": "no", "vmap": "no", "jacrev": "no"}
+    "WebcamSolver": Example(webcam_solver, webcam_inputs, cells={"gradients": "no", "vmap": "no", "jacrev": "no"}),
+    "ExampleSolver": Example(
+        lambda n: ExampleSolver(example_shapes(n)), lambda: (seen_landmarks(),), cells=TO_ONNX
     ),
-    "ExampleSolver": Example(example_solver, lambda: (seen_landmarks(),), cells={**SOLVER, "torch.export": "ONNX"}),
-    "ExampleSolver with LandmarkModel": Example(
-        projecting_example_solver, lambda: (seen_landmarks(),), cells={**SOLVER, "torch.export": "ONNX"}
-    ),
+    "ExampleSolver with LandmarkModel": Example(projecting_example_solver, lambda: (seen_landmarks(),), cells=TO_ONNX),
     "FixedSplitting": Example(
         lambda n: FixedSplitting(random(12, 6, seed=n).T @ random(12, 6, seed=n), steps=3),
         lambda: (random(10, 6, seed=3) - 1,),
@@ -376,11 +364,9 @@ EXAMPLES: dict[str, Example] = {
     "HeadModel": Example(head_model, lambda: (random(3, 3).float(), random(3, 3).float())),
     "ExpressionRegression": Example(expression_regression, lambda: (rig().vertices[None],), cells={"vmap": "no"}),
     "EnhancementModel": Example(
-        enhancement_model, lambda: (rig()(0.5 * random(2, len(NAMES)).float()),), cells={**SOLVER, "torch.export": "no"}
+        enhancement_model, lambda: (rig()(0.5 * random(2, len(NAMES)).float()),), cells=NOT_EXPORTED
     ),
-    "WrinkleWeights": Example(
-        wrinkle_weights, lambda: (rig()(0.5 * random(2, len(NAMES)).float()),)
-    ),
+    "WrinkleWeights": Example(wrinkle_weights, lambda: (rig()(0.5 * random(2, len(NAMES)).float()),)),
     "ActionUnitClassifier": Example(
         action_unit_classifier, lambda: (random(3, 2, 16, 16).float(), random(2, 16, 16, seed=1).float()),
         cells={"gradients": "no", "jacrev": "no"},
@@ -389,12 +375,10 @@ EXAMPLES: dict[str, Example] = {
         landmark_trees, lambda: (random(2, 1, 40, 40).float(), torch.tensor([[5.0, 5, 30, 30], [8, 6, 25, 28]])),
         cells={"gradients": "no", "jacrev": "no"},
     ),
-    "AppearanceModel": Example(
-        appearance_model, appearance_inputs, cells={**SOLVER, "torch.export": "no"}
-    ),
+    "AppearanceModel": Example(appearance_model, appearance_inputs, cells=NOT_EXPORTED),
     "UVLandmarkDetector": Example(
         uv_detector, lambda: (random(2, 1, 96, 96, seed=1).float(),),
-        cells={**SOLVER, "gradients": "no", "jacrev": "no", "torch.export": "no"},
+        cells={**NOT_EXPORTED, "gradients": "no", "jacrev": "no"},
     ),
     "LandmarkNetwork": Example(
         network(lambda: LandmarkNetwork(32, channels=(4, 4, 6, 8), blocks=(1, 1, 1), decoder=6, points=5, hidden=12)),

@@ -62,8 +62,6 @@ class EnhancementModel(nn.Module):
     database's; the same combinations of the database's details, blended over the regions' soft borders, go onto
     :math:`\ell` in the place of what a itself had beyond it; lids that a shows itself stay, see ``InputLids``.
 
-    Made by :meth:`fit`. The constructor makes an empty model for a state to be loaded into.
-
     Args:
         sizes: of what it holds.
         region_names: of the R regions.
@@ -243,8 +241,7 @@ class EnhancementModel(nn.Module):
 
     def features(self, coarse: Tensor) -> Tensor:
         """Rotation vector and stretch of each patch of the smooth part, (T,P,9), of frames (T,V,3)."""
-        coarse = self._checked(coarse)
-        smooth, encoder = self._smooth(coarse)[0], self.prepared.encoder
+        smooth, encoder = self._smooth(self._checked(coarse))[0], self.prepared.encoder
         return encoder.gradients.features(smooth, encoder.frames.turned(smooth))
 
     def low(self, coarse: Tensor) -> Tensor:
@@ -369,8 +366,7 @@ class EnhancementModel(nn.Module):
         if self.settings.matching == "learned":
             shares = self.map_shares.to(features)
             coefficients = coefficients + prepared.learned_map.corrections(features, matched, self.map_reach, shares)
-        weights = encoder.detail.site_weights(prepared.vertex_weights)
-        details = blended(self.components, coefficients, weights)
+        details = blended(self.components, coefficients, encoder.detail.site_weights(prepared.vertex_weights))
         low, own = (self.neutral.to(smooth) + moved for moved in (smooth, displacements))
         if self.keeps_input:
             vertices = encoder.detail.compose(own, details, turned)

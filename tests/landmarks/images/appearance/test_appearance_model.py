@@ -9,13 +9,8 @@ import torch
 from scipy.interpolate import RBFInterpolator
 from torch import Tensor
 
-from planted.portrait_video import (
-    EXPRESSIONS,
-    PortraitVideo,
-    expression_weights,
-    mixed_expressions,
-    render_portrait_video,
-)
+from planted import portrait_video
+from planted.portrait_video import EXPRESSIONS, PortraitVideo, expression_weights, mixed_expressions
 from torchface import zoo
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.io.images.image_files import load_image
@@ -29,25 +24,19 @@ from torchface.landmarks.images.appearance.shape_modes import (
     similarity_modes,
 )
 from torchface.landmarks.images.ibug_68 import box_around
-from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 
 TRAINED, TESTED = len(EXPRESSIONS), 10
 
 
 @pytest.fixture(scope="module")
-def actor() -> BlendshapeRig:
-    return performer(draw_identities(1, torch.Generator().manual_seed(3))[0])
-
-
-@pytest.fixture(scope="module")
-def film(actor: BlendshapeRig) -> PortraitVideo:
+def film() -> PortraitVideo:
     """Fifteen frames to learn from, and ten of other mixtures of the same extremes."""
+    actor = performer(draw_identities(1, torch.Generator().manual_seed(3))[0])
     generator = torch.Generator().manual_seed(3)
     poses = expression_weights(actor.names, list(EXPRESSIONS.values()))
-    return render_portrait_video(
-        actor, torch.cat([poses, mixed_expressions(actor.names, TESTED, generator)]), generator
-    )
+    mixed = mixed_expressions(actor.names, TESTED, generator)
+    return portrait_video.render_portrait_video(actor, torch.cat([poses, mixed]), generator)
 
 
 @pytest.fixture(scope="module")
@@ -134,9 +123,7 @@ def test_faces_of_a_batch_are_fitted_as_each_alone(film: PortraitVideo, model: A
         torch.testing.assert_close(alone.error[0], together.error[i], rtol=1e-2, atol=0)
 
 
-def test_a_larger_and_turned_picture_has_its_landmarks_where_they_were(
-    film: PortraitVideo, model: AppearanceModel
-) -> None:
+def test_a_larger_turned_picture_has_its_landmarks_where_they_were(film: PortraitVideo, model: AppearanceModel) -> None:
     """Twice the pixels and upside down: the similarity belongs to the pose, not to the face."""
     pictures, start = images(film)[:4], half_neutral(film)[:4]
     found = model(pictures, start)
@@ -334,9 +321,7 @@ def test_a_face_that_is_lost_stays_lost(film: PortraitVideo, model: AppearanceMo
     assert nothing.landmarks.isnan().all()
 
 
-def test_pictures_of_any_precision_are_taken_and_integers_are_refused(
-    film: PortraitVideo, model: AppearanceModel
-) -> None:
+def test_floats_of_any_precision_are_taken_and_integers_refused(film: PortraitVideo, model: AppearanceModel) -> None:
     shown, start = images(film)[:1], half_neutral(film)[:1]
     wanted = model(shown, start)
     torch.testing.assert_close(model(shown.double(), start), wanted)
@@ -348,23 +333,21 @@ def test_pictures_of_any_precision_are_taken_and_integers_are_refused(
 
 def test_bad_input_is_refused_by_name(film: PortraitVideo, model: AppearanceModel) -> None:
     frames, points = list(film.frames[:4]), film.landmarks[:4]
-    with pytest.raises(ShapeError, match="found 2, expected at least 3"):
-        AppearanceModel.fit(frames[:2], points[:2])
-    with pytest.raises(ShapeError, match=r"found \(4, 67, 2\), expected \(4, 68, 2\)"):
-        AppearanceModel.fit(frames, points[:, 1:])
     holed = points.clone()
     holed[2, 40] = torch.nan
-    with pytest.raises(ValueRangeError, match="landmarks 2: found NaN"):
-        AppearanceModel.fit(frames, holed)
-    with pytest.raises(ValueRangeError, match="landmarks 0: found some far outside"):
-        AppearanceModel.fit(frames, points + 500)
-    with pytest.raises(ValueRangeError, match="landmarks 0: found all on one line"):
-        AppearanceModel.fit(frames, points * torch.tensor([1.0, 0.0]) + 50)
-    for count in (4, 7):  # a mean of seven equal numbers is rounded
-        with pytest.raises(ValueRangeError, match="images: found faces that all look the same"):
-            AppearanceModel.fit(frames[:1] * count, points[:1].expand(count, -1, -1))
-    with pytest.raises(ShapeError, match="image 1"):
-        AppearanceModel.fit([frames[0], frames[1][None, None], *frames[2:]], points)
+    alike = "images: found faces that all look the same"
+    for error, message, pictures, marks in [
+        (ShapeError, "found 2, expected at least 3", frames[:2], points[:2]),
+        (ShapeError, r"found \(4, 67, 2\), expected \(4, 68, 2\)", frames, points[:, 1:]),
+        (ValueRangeError, "landmarks 2: found NaN", frames, holed),
+        (ValueRangeError, "landmarks 0: found some far outside", frames, points + 500),
+        (ValueRangeError, "landmarks 0: found all on one line", frames, points * torch.tensor([1.0, 0.0]) + 50),
+        (ValueRangeError, alike, frames[:1] * 4, points[:1].expand(4, -1, -1)),
+        (ValueRangeError, alike, frames[:1] * 7, points[:1].expand(7, -1, -1)),  # a mean of seven equals is rounded
+        (ShapeError, "image 1", [frames[0], frames[1][None, None], *frames[2:]], points),
+    ]:
+        with pytest.raises(error, match=message):
+            AppearanceModel.fit(pictures, marks)
     with pytest.raises(ShapeError, match=r"initial: found \(2, 67, 2\)"):
         model(images(film)[:2], torch.zeros(2, 67, 2))
     with pytest.raises(ShapeError, match=r"expected \(B,1,H,W\) or \(B,3,H,W\)"):

@@ -149,11 +149,9 @@ class AppearanceModel(nn.Module):
     ) -> None:
         super().__init__()
         self.settings = AppearanceSettings.of(settings)
-        if not len(places) == len(texture_modes) == len(self.settings.resolutions):
-            raise ShapeError(
-                f"appearance: found {len(places)} and {len(texture_modes)} levels, "
-                f"expected {len(self.settings.resolutions)}"
-            )
+        levels = len(self.settings.resolutions)
+        if not len(places) == len(texture_modes) == levels:
+            raise ShapeError(f"appearance: found {len(places)} and {len(texture_modes)} levels, expected {levels}")
         channels = CHANNELS[self.settings.features]
         self._maps: Prepared[_LinearMaps] = Prepared()
         self.register_buffer("mean_shape", torch.zeros(COUNT, 2))
@@ -270,13 +268,8 @@ class AppearanceModel(nn.Module):
         return self._error_in(self.crop(self._grey(images), points, float(self.levels[-1].scale)), points)
 
     def crop(self, images: Tensor, landmarks: Tensor, resolution: float) -> FaceCrop:
-        """Upright images of faces, ``resolution`` pixels a unit of the mean shape, as features.
-
-        Args:
-            images: grey, (B,1,H,W).
-            landmarks: (B,68,2), pixels.
-            resolution: pixels a unit of the mean shape.
-        """
+        """Upright images of faces, as features: of grey images (B,1,H,W) and landmarks (B,68,2) in pixels,
+        ``resolution`` pixels a unit of the mean shape."""
         low, high = self._extent()
         pose = planar_pose(self.mean_shape, landmarks)
         # From the crop's pixels: by its corner and resolution to units, then by the face's pose to the image.
@@ -322,17 +315,13 @@ class AppearanceModel(nn.Module):
             warp = self._linear_parts(points)
             pose, shape = self._shape(points - (warp * moved[:, :, None]).sum(3))
             ahead = self._landmarks(pose, shape)
-            still = still | ~self._plausible(ahead, pose, level)
+            size = pose.scale / level.scale  # of about 1 for faces in a crop
+            still = still | ~(torch.isfinite(ahead).flatten(1).all(1) & (size > 0.5) & (size < 2))
             ahead = torch.where(still[:, None, None], points, ahead)
             state = torch.where(still[:, None], state, shape)
             still = still | ((ahead - points).flatten(1).abs().amax(1) < _STILL)
             points = ahead
         return best
-
-    def _plausible(self, landmarks: Tensor, pose: PlanarPose, level: AppearanceLevel) -> Tensor:
-        """Whether landmarks (B,68,2) in a crop are finite, and of about the size that faces have in it, (B,)."""
-        size = pose.scale / level.scale
-        return torch.isfinite(landmarks).flatten(1).all(1) & (size > 0.5) & (size < 2)
 
     def _points(self, landmarks: Tensor) -> Tensor:
         return self._linear_maps().points @ landmarks
@@ -395,10 +384,7 @@ class AppearanceModel(nn.Module):
 
 def _cut_out(images: Tensor, pose: PlanarPose, size: tuple[int, int], samples: int) -> Tensor:
     """Images (B,1,height,width) whose pixels lie where a pose puts them, each a mean over ``samples`` a side."""
-    x, y = (
-        (torch.arange(count * samples, device=images.device, dtype=images.dtype) + 0.5) / samples - 0.5
-        for count in size
-    )
+    x, y = ((torch.arange(count * samples).to(images) + 0.5) / samples - 0.5 for count in size)
     cos, sin = pose.rotation.real[:, None, None], pose.rotation.imag[:, None, None]
     right, down = pose.translation.real[:, None, None], pose.translation.imag[:, None, None]
     places = torch.stack([cos * x + (right - sin * y[:, None]), sin * x + (down + cos * y[:, None])], dim=-1)
