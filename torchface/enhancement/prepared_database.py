@@ -125,7 +125,8 @@ class PreparedDatabase:
     @torch.no_grad()
     def projection(self) -> RegionProjection:
         """What finds each region's blend of the database for a coarse frame."""
-        return RegionProjection(self.features, self.patch_weights, temporal=self.settings.temporal)
+        # In double precision: the learned map multiplies what frames have beyond the database.
+        return RegionProjection(self.features.double(), self.patch_weights, temporal=self.settings.temporal)
 
     @cached_property
     @torch.no_grad()
