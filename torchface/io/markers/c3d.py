@@ -133,7 +133,7 @@ def _positions(data: bytes, sections: Sections, path: Path) -> np.ndarray:
     fitting = [int(count) for count in counts if count <= stored]
     if not fitting:
         raise FileFormatError(
-            f"{path}: found {counts[0]:.0f} frames of {frame_size} bytes announced and room for {stored} behind byte "
+            f"{path}: found {counts[0]:.0f} frames of {frame_size} bytes announced and space for {stored} behind byte "
             f"{start}, expected all of them; is the file cut off?"
         )
     frames = fitting[0]

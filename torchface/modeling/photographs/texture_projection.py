@@ -249,7 +249,7 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
         edge = graph.smoothed(1 - covered[:, None], torch.ones_like(covered), _FEATHER)[:, 0]
         seen_color = guess / covered.clamp(min=1e-9)[:, None]
         typical = covered * _typical(seen_color, mean)
-        # Far from any edge, as at the neck, the base has the hue that the face has: the light's is known roughly.
+        # Far from any edge, as at the neck, the base has the face's hue: that of the light is known roughly alone.
         under = under * _median_ratio(seen_color, under, typical > 0.5)
         weight = (edge + 1e-3) * typical
         return guess + (1 - covered)[:, None] * _toned(under, seen_color, weight, graph, _FILL)
