@@ -12,6 +12,7 @@ import pytest
 import torch
 from browser import posted
 from osc_receiver import values_by_address
+from planted_graph import write_planted_graph
 from rig_samples import corrective_sheet, named_sheet, quad_sheet
 from scipy.spatial.transform import Rotation
 from test_vrm_in_browser import browser as vrm_browser  # noqa: F401  (three-vrm's packages)
@@ -27,6 +28,7 @@ from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.protocols.vmc_packets import VmcPackets
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.shape_names import ARKIT, VRM1, mapping
+from torchface.workflows.browser_app import app_folder
 from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.head_rotations import head_angles
 
@@ -393,3 +395,14 @@ def test_shapes_that_move_nothing_are_named(tmp_path: Path) -> None:
     deltas = rig.deltas * torch.tensor([1.0, 1.0, 0.0])[:, None, None]
     save_rig(BlendshapeRig(rig.neutral, deltas, rig.names), tmp_path / "two.glb")
     assert load_character(tmp_path / "two.glb").still == ("tongueOut",)
+
+
+def test_the_tongue_is_not_counted_among_what_a_face_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "page" / "assets").mkdir(parents=True)
+    (tmp_path / "page" / "assets" / "page.js").write_text("page")
+    monkeypatch.setattr(app_folder, "built_page", lambda progress: tmp_path / "page")
+    write_planted_graph(tmp_path / "planted.onnx")
+    path = sheet(tmp_path / "sheet.glb", ("jawOpen", "Tongue_Out", "antenna"))
+    report = app_folder.export_app(tmp_path / "app", path, tmp_path / "planted.onnx")
+    assert (report.driven, report.still) == (("jawOpen",), ("Tongue_Out", "antenna"))
+    assert ("shapes that a face moves", "1 of 3") in report.rows()

@@ -20,6 +20,7 @@ from torchface.workflows.webcam.webcam_graph import webcam_graph
 CHARACTER, TABLE, GRAPH, PAGE = "character.glb", "character.json", "webcam.graph", "index.html"
 _ASSETS, _FORMER_GRAPHS = (".js", ".css", ".wasm"), ("webcam.onnx", "webcam.ort")
 _BYTES = 4  # of a number
+_TONGUE = ARKIT.index("tongueOut")
 
 
 @dataclass(frozen=True)
@@ -29,7 +30,7 @@ class AppReport:
     Args:
         sizes: bytes of each file by its path inside the folder.
         packed: the same as gzip has them, which is what a host that compresses sends.
-        driven: the character's shapes that a face moves.
+        driven: the character's shapes that a face before the camera, which does not see its tongue, moves.
         still: its other shapes, and those that move nothing.
     """
 
@@ -101,8 +102,10 @@ def export_app(
             if (out / former).is_file():
                 delete_file(out / former)
     packed = {name: len(gzip.compress(data, 6)) for name, data in files.items()}
-    still = tuple(dict.fromkeys((*shown.shapes.undriven, *shown.still)))
-    driven = tuple(name for name in shown.names if name not in still)
+    sources = zip(shown.names, shown.shapes.matrix, shown.shapes.products, strict=True)
+    moved = {name for name, sums, product in sources if {*sums.nonzero()[:, 0].tolist(), *product} - {_TONGUE}}
+    driven = tuple(name for name in shown.names if name in moved.difference(shown.still))
+    still = tuple(name for name in shown.names if name not in driven)
     return AppReport({name: len(data) for name, data in files.items()}, packed, driven, still)
 
 
