@@ -35,7 +35,7 @@ def annotate(
 
     Args:
         video: A video of the actor, extreme faces among what it shows.
-        out: The folder for images and .pts files.
+        out: The folder for images and .pts files. What is not saved at the end is kept in its folder "unsaved".
         landmarks: What finds landmarks to start from: a model of the zoo by name or folder, an .onnx file, or
             MediaPipe's Face Landmarker (.task); or a .csv that holds those of the whole video.
         count: How many frames.

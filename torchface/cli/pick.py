@@ -36,7 +36,7 @@ def pick(
         mesh: A mesh or rig: .glb, USD, .obj, .ply, .stl, .off, a folder of OBJ files, or ICT-FaceKit's FaceXModel
             folder.
         scan: A mesh to find the same places on: click on the head, then on the scan.
-        out: The folder to save into.
+        out: The folder to save into. What is not saved at the end is kept in its folder "unsaved".
         mode: What to pick first; the page can change it.
         landmarks: iBUG's 68, or the twelve of eyes, nose, cheeks and mouth.
         names: Names of landmarks of your own instead; "left" and "right" in a name are mirror images.

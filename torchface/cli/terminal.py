@@ -73,13 +73,17 @@ _ONCE = 2.0  # seconds
 
 
 def serve_page(page: "BrowserPage", line: str = "") -> None:
-    """Prints a page's address and waits until it is closed, or for Ctrl-C, which closes it."""
+    """Prints a page's address and waits until it is closed, or for Ctrl-C, which closes it and keeps unsaved work."""
     console.print(f"{line}Open this page; Ctrl+C ends.")
     print(page.url, flush=True)
     try:
         page.wait()
     except KeyboardInterrupt:
         page.stop()
+        kept = page.keep_unsaved()
+        print_lines(
+            f"warning: the page's Save did not write the last changes; they are kept in {path}" for path in kept
+        )
 
 
 def count_interrupts_once() -> None:

@@ -27,6 +27,7 @@ def view(
         rig: A .glb or USD file, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         weights: A weight take to play and edit, such as a Live Link Face CSV or an animated .glb, also the rig's own.
         out: Where Save writes the weights: a .csv; if absent edited_weights.csv here, or beside the take.
+            What is not saved at the end is kept beside it, as NAME_unsaved.csv.
         port: The first port to try.
     """
     from torchface.files.whole_files import check_ending, check_writable

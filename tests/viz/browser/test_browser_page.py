@@ -5,6 +5,7 @@ import socket
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,9 +13,17 @@ import torch
 
 from torchface import BlendshapeRig, Take, Track, load_take
 from torchface.cli.pick import pick
+from torchface.cli.terminal import serve_page
 from torchface.cli.view import view
 from torchface.errors import MissingExtraError, NameMismatchError, ValueRangeError
-from torchface.viz.browser.browser_page import LAST_PORT, free_port
+from torchface.io.landmarks.landmark_points import load_landmark_points
+from torchface.landmarks.images.appearance.annotated_frames import AnnotatedFrame
+from torchface.viz.browser.annotation_session import AnnotationSession
+from torchface.viz.browser.browser_page import LAST_PORT, BrowserPage, free_port
+from torchface.viz.browser.landmark_editor import LandmarkEditor
+from torchface.viz.browser.landmark_sets import custom_set
+from torchface.viz.browser.pick_session import SurfacePoint
+from torchface.viz.browser.picker import Picker
 from torchface.viz.browser.rig_viewer import RigViewer
 
 on_linux = pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="asks Linux who listens at which address")
@@ -101,6 +110,49 @@ def test_edited_weights_are_saved_for_the_frames_they_were_made_in(ball_rig: Ble
     expected[12, [1, 2]] = 0.625  # symmetric
     assert found.weights.names == ball_rig.names
     torch.testing.assert_close(found.weights.values[..., 0], expected)
+
+
+def test_what_was_not_saved_is_kept_when_the_page_is_closed(
+    ball_rig: BlendshapeRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture
+) -> None:
+    pytest.importorskip("viser", reason="the extra viewer is not installed")
+
+    def interrupted(page: BrowserPage) -> None:
+        raise KeyboardInterrupt
+
+    def closed(page: BrowserPage) -> list[Path]:
+        before = set(tmp_path.rglob("*.*"))
+        serve_page(page)
+        new = [path for path in {*tmp_path.rglob("*.*")} - before if path.suffix != ".png"]
+        said = "".join(capsys.readouterr().err.split())
+        assert said.count("warning:") == len(new)
+        assert all(str(path) in said for path in new)
+        return new
+
+    monkeypatch.setattr(BrowserPage, "wait", interrupted)
+    viewer = RigViewer(ball_rig, out=tmp_path / "edited.csv", port=0)
+    viewer.set_weight("jawOpen", 0.5)
+    viewer.save()
+    assert closed(viewer) == []
+    viewer = RigViewer(ball_rig, out=tmp_path / "edited.csv", port=0)
+    viewer.set_weight("jawOpen", 0.75)
+    assert closed(viewer) == [tmp_path / "edited_unsaved.csv"]
+    kept = [load_take(tmp_path / f"edited{end}.csv").weights.values[0, :, 0] for end in ("", "_unsaved")]
+    assert [float(row[ball_rig.names.index("jawOpen")]) for row in kept] == [0.5, 0.75]
+    picker, again = (Picker(ball_rig, None, tmp_path / "picks", custom_set(["ear", "chin"]), port=0) for _ in "ab")
+    picker.session.pick_landmark(SurfacePoint(0, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0))
+    assert closed(picker) == [tmp_path / "picks" / "unsaved" / "landmarks.json"]
+    again.session.resume(tmp_path / "picks" / "unsaved")
+    again.save()
+    assert again.session.picks.landmarks == (0, None)
+    assert closed(again) == []
+    frame = AnnotatedFrame("one", torch.zeros(3, 64, 64), 20 + torch.arange(136.0).reshape(68, 2) / 8)
+    session = AnnotationSession([frame, replace(frame, name="two")], tmp_path / "frames")
+    session.grab(30)
+    session.drag(torch.tensor([50.0, 11.0]))
+    points = tmp_path / "frames" / "unsaved" / "one.pts"
+    assert closed(LandmarkEditor(session, port=0)) == [points]
+    assert load_landmark_points(points).points[30].tolist() == [50.0, 11.0]
 
 
 def test_a_take_that_cannot_be_played_is_refused(ball_rig: BlendshapeRig) -> None:

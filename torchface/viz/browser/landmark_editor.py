@@ -1,6 +1,7 @@
 """The annotation page: a frame with its 68 landmarks, which are dragged to where they belong."""
 
 import math
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -84,6 +85,10 @@ class LandmarkEditor(BrowserPage):
             self.chosen = None
             self._show_frame()
             return f"{path}" if more else f"{path}; all frames are saved now"
+
+    def keep_unsaved(self) -> list[Path]:
+        """Writes the frames that changed since they were saved into the folder's ``unsaved``."""
+        return self.session.keep_unsaved()
 
     @property
     def _unit(self) -> float:

@@ -20,7 +20,7 @@ from torchface.viz.browser.browser_page import SCALE, BrowserPage, frame_camera,
 from torchface.viz.browser.head_mesh import HeadOnPage
 from torchface.viz.browser.html_lists import caption, pick_list
 from torchface.viz.browser.landmark_sets import IBUG_68, LandmarkSet
-from torchface.viz.browser.pick_session import PickSession, SurfacePoint
+from torchface.viz.browser.pick_session import Picks, PickSession, SurfacePoint
 
 if TYPE_CHECKING:
     import viser
@@ -62,6 +62,7 @@ class Picker(BrowserPage):
             self.session.resume(self.out)
         except TopologyError as error:
             raise TopologyError(f"{self.out}: {error}, or give another --out") from None
+        self._saved = self.session.picks
         modes = MODES if scan is not None else MODES[:2]
         if mode not in modes:
             raise ValueRangeError(f"mode: found {mode!r}, expected {' or '.join(modes)}; pairs need a scan")
@@ -93,7 +94,16 @@ class Picker(BrowserPage):
     def save(self) -> list[Path]:
         """Writes what is picked into the folder."""
         with self._lock:
-            return save_picks(self.session, self.out, self.rig)
+            written = save_picks(self.session, self.out, self.rig)
+            self._saved = self.session.picks
+            return written
+
+    def keep_unsaved(self) -> list[Path]:
+        """Writes picks since the last save into the folder's ``unsaved``, which a new start can be given."""
+        picks = replace(self.session.picks, waiting=None)
+        if picks in (replace(self._saved, waiting=None), Picks((None,) * len(picks.landmarks))):
+            return []
+        return save_picks(self.session, self.out / "unsaved", self.rig)
 
     def _nearest(self, origin: Tensor, direction: Tensor) -> tuple[SurfacePoint | None, bool]:
         """The first surface in the ray's way, and whether it is the scan's."""

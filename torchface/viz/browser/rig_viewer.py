@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
@@ -52,6 +53,7 @@ class RigViewer(BrowserPage):
         weights = None if take is None or take.weights is None else rig.weights_from(take.weights)
         self.rig, self.take, self.out = rig, take, Path(out)
         self.editor = WeightEditor(rig.names, weights, spread=0 if weights is None else _SPREAD, symmetric=True)
+        self._saved = self.editor.weights.clone()
         times = None if take is None or take.seconds is None else tuple(take.times.tolist())
         self.playback = Playback(len(self.editor), 60.0 if take is None else take.fps, times=times)
         self._moved_at = self._panel_at = float("-inf")
@@ -84,9 +86,19 @@ class RigViewer(BrowserPage):
     def save(self) -> Path:
         """Writes the weights as they stand now."""
         with self._lock:
-            make_folder(self.out.parent)
-            save_take(self.editor.to_take(self.take), self.out)
-        return self.out
+            written, self._saved = self._write(self.out), self.editor.weights.clone()
+            return written
+
+    def keep_unsaved(self) -> list[Path]:
+        """Writes the weights beside the file, as ``NAME_unsaved.csv``, if they changed since the last save."""
+        if torch.equal(self.editor.weights, self._saved):
+            return []
+        return [self._write(self.out.with_name(f"{self.out.stem}_unsaved.csv"))]
+
+    def _write(self, path: Path) -> Path:
+        make_folder(path.parent)
+        save_take(self.editor.to_take(self.take), path)
+        return path
 
     def _vertices(self) -> Tensor:
         return self.rig(self.editor.pose[None].to(self.rig.deltas))[0].detach()
