@@ -154,6 +154,16 @@ def test_landmarks_that_are_not_trusted_are_no_face(rig: BlendshapeRig, takes: l
         torch.testing.assert_close(frame["weights"].double(), state.weights, atol=1e-4, rtol=0)
 
 
+def test_an_infinite_landmark_is_one_that_is_not_seen(rig: BlendshapeRig) -> None:
+    solver = VideoSolver(rig, None, K)
+    _, landmarks = synthetic_landmarks(solver, 3)
+    lost, infinite = landmarks.clone(), landmarks.clone()
+    lost[1, 30], infinite[1, 30] = torch.nan, torch.tensor([torch.inf, 200.0])
+    for one, other in zip(played(VideoGraph(solver), infinite), played(VideoGraph(solver), lost), strict=True):
+        assert bool(one["weights"].isfinite().all())
+        assert all(torch.equal(one[name], other[name]) for name in one)
+
+
 def corrective_rig(rig: BlendshapeRig) -> BlendshapeRig:
     definitions = (Corrective("open_smile", ("jawOpen", "mouthSmileLeft")), Corrective("open_half", ("jawOpen",), 0.5))
     deltas = 0.4 * rig.deltas[rig.index(["mouthSmileLeft", "jawOpen"])].roll(1, 2)

@@ -118,7 +118,7 @@ class VideoGraph(nn.Module):
         """The frame's ``outputs``.
 
         Args:
-            landmarks: (68,2), pixels; NaN for not seen.
+            landmarks: (68,2), pixels; NaN or infinity for not seen.
             confidence: how far each is trusted, (68,) in [0,1].
             previous: the ``state`` of the frame before, or ``start()``.
 
@@ -131,7 +131,7 @@ class VideoGraph(nn.Module):
                 f"{len(previous)} parts of a state, expected ({LANDMARKS},2), ({LANDMARKS},) and {len(self.state)}"
             )
         state = {name: value.double() for name, value in zip(self.state, previous, strict=True)}
-        unseen = torch.isnan(landmarks).any(1) | ~(confidence > 0)
+        unseen = ~torch.isfinite(landmarks).all(1) | ~(confidence > 0)
         pixels = torch.where(unseen[:, None], 0.0, landmarks.double())
         trust = torch.where(unseen, 0.0, self.landmark_weights * confidence.double())
         enough = (~unseen).double().sum() > _MIN_LANDMARKS - 0.5
