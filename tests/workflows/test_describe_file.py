@@ -132,6 +132,11 @@ def test_shapes_that_move_the_whole_mesh_are_said(tmp_path: Path) -> None:
     deltas = torch.stack([rig.deltas[0], torch.tensor([3.0, 0.0, 4.0]).expand_as(rig.vertices)])
     save_rig(BlendshapeRig(rig.neutral, deltas, rig.names), tmp_path / "rig.glb")
     assert "all vertices alike in jawLeft (5.0 mm)" in dict(describe(tmp_path / "rig.glb"))["warning"]
+    nothing = BlendshapeRig(rig.neutral, deltas * torch.tensor([1.0, 2e-4])[:, None, None], rig.names)
+    save_rig(nothing, tmp_path / "rig.glb")
+    rows = dict(describe(tmp_path / "rig.glb"))
+    assert "warning" not in rows
+    assert "(its jawLeft moves nothing)" in rows["ARKit's shapes"]
 
 
 def test_heads_beside_each_other_are_listed_and_one_head_is_not(tmp_path: Path) -> None:

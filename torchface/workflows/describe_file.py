@@ -55,6 +55,7 @@ Rows = list[tuple[str, str]]
 _MAX_LENGTH = 240
 _LENGTH, _LONGEST_HEADER = "_mm", 4096  # ends the names of columns that are no weights
 _MAX_NAMED, _MAX_LISTED = 8, 10
+_STILL = 1e-5  # of a head's extent; by no more a shape moves nothing
 _ALIKE = 0.01  # of a shape's motion: by no more its vertices differ where it moves the whole mesh
 _LANDMARK_ENDINGS = (".ljson", ".pts", ".xml")
 _ARRAY_ENDINGS = (".npz", ".npy", ".safetensors")
@@ -260,6 +261,7 @@ def _extent(points: Tensor) -> str:
 
 def _rig_rows(rig: BlendshapeRig) -> Rows:
     reach = rig.deltas.norm(dim=-1).amax(1)
+    reach = reach * (reach > _STILL * (rig.vertices.amax(0) - rig.vertices.amin(0)).max())
     order = reach.argsort(descending=True)[:_MAX_NAMED].tolist()
     largest = ", ".join(f"{rig.names[row]} {float(reach[row]):.1f}" for row in order)
     rows = [*_mesh_rows(rig.neutral), ("shapes", _named(rig.names)), ("largest motions, mm", largest)]
