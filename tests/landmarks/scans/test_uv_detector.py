@@ -85,6 +85,16 @@ def test_a_featureless_image_gives_the_usual_place_without_confidence(detector: 
     assert found.confidence.max() < 0.05
 
 
+def test_images_that_are_not_finite_are_refused(detector: UVLandmarkDetector) -> None:
+    (one, places), (other, _) = drawn(60), drawn(61)
+    images = torch.stack([one, other])
+    images[1, 0, 20, 30] = torch.nan
+    with pytest.raises(ValueRangeError, match=r"images: found NaN or infinity in row 1, expected numbers in \[0,1\]"):
+        detector(images)
+    with pytest.raises(ValueRangeError, match="images: found NaN or infinity in row 1"):
+        UVLandmarkDetector.fit(images, places.expand(2, -1, -1), NAMES, settings=SETTINGS)
+
+
 def test_a_model_saved_under_the_old_names_loads(tmp_path: Path) -> None:
     """Keys of the state, and the word for what it sees, as they were."""
     images, places = zip(*(drawn(seed) for seed in range(3)), strict=True)

@@ -176,7 +176,7 @@ class UVLandmarkDetector(nn.Module):
 
         Raises:
             ShapeError: images and landmarks do not fit each other.
-            ValueRangeError: fewer than two images, or a landmark that fewer than two have.
+            ValueRangeError: fewer than two images, a landmark that fewer than two have, or images with NaN or infinity.
         """
         _check_training(images, landmarks, names)
         images, landmarks = images.detach(), landmarks.detach()
@@ -206,9 +206,11 @@ class UVLandmarkDetector(nn.Module):
 
         Raises:
             ShapeError: images of another size than those learned from.
+            ValueRangeError: images with NaN or infinity.
         """
         if images.ndim != 4 or images.shape[-2:] != (self.size, self.size):
             raise ShapeError(f"images: found {tuple(images.shape)}, expected (B,C,{self.size},{self.size})")
+        _check_finite(images)
         pixels = self.prior_mean.repeat(len(images), 1, 1)
         confidence = torch.zeros(pixels.shape[:2], dtype=pixels.dtype, device=pixels.device)
         for b, image in enumerate(images):  # one image's responses are 100 MB; a batch of them would be too much
@@ -332,11 +334,17 @@ class UVLandmarkDetector(nn.Module):
         return self._raw_cells(images) - self.mean_cell[None, :, None, None]
 
 
+def _check_finite(images: Tensor) -> None:
+    if bad := (~images.isfinite()).flatten(1).any(1).nonzero()[:, 0].tolist():
+        raise ValueRangeError(f"images: found NaN or infinity in row {bad[0]}, expected numbers in [0,1]")
+
+
 def _check_training(images: Tensor, landmarks: Tensor, names: tuple[str, ...]) -> None:
     if images.ndim != 4 or images.shape[-1] != images.shape[-2]:
         raise ShapeError(f"images: found {tuple(images.shape)}, expected (M,C,S,S)")
     if landmarks.shape != (len(images), len(names), 2):
         raise ShapeError(f"landmarks: found {tuple(landmarks.shape)}, expected ({len(images)},{len(names)},2)")
+    _check_finite(images)
     known = torch.isfinite(landmarks).all(-1).sum(0)
     if len(images) < 2 or int(known.min()) < 2:
         raise ValueRangeError(
