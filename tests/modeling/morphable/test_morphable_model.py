@@ -221,6 +221,9 @@ def test_a_part_of_a_model_draws_the_same_heads(dome_rig: BlendshapeRig) -> None
     torch.testing.assert_close(cut.T @ cut, (whole.T @ whole)[columns][:, columns], rtol=0, atol=1e-6)
     torch.testing.assert_close(part.rig.deltas, dome_rig.deltas[:, ids])
     assert torch.equal(model.part(keep).components, model.part(ids).components)
+    for nothing in (ids[:0], torch.zeros_like(keep)):
+        with pytest.raises(ValueRangeError, match="vertices: found none, expected at least one"):
+            model.part(nothing)
 
 
 def test_a_rig_travels_with_a_head_model(dome_rig: BlendshapeRig, tmp_path: Path) -> None:

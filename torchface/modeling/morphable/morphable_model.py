@@ -258,6 +258,8 @@ class MorphableModel(nn.Module):
         """The same distribution seen at some vertices only, ids (N,) or a mask (V,); its components are orthonormal
         there."""
         vertices = self._chosen(vertices)
+        if len(vertices) == 0:
+            raise ValueRangeError("vertices: found none, expected at least one")
         modes = self.modes[:, vertices].double().flatten(1)
         _, deviations, components = torch.linalg.svd(modes, full_matrices=False)
         kept = deviations > 1e-6 * deviations[0].clamp(min=1e-12)
