@@ -8,9 +8,9 @@ from torch import Tensor
 
 from torchface import zoo
 from torchface.capture.anybody import WebcamControls, WebcamSettings, WebcamSolver, WebcamState
-from torchface.errors import ShapeError, ValueRangeError
+from torchface.errors import ArgumentTypeError, ShapeError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
-from torchface.landmarks.images.face_reading import FaceReading
+from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading
 from torchface.shape_names import ARKIT
 from torchface.synthetic import performer
 
@@ -253,3 +253,28 @@ def test_antagonists_are_never_on_together(solver: WebcamSolver, person: Tensor)
         first, second = state.weights.double() @ pairs.T.clamp(min=0), state.weights.double() @ (-pairs.T).clamp(min=0)
         assert float(torch.minimum(first, second).max()) < 1e-6
     assert float(state.weights[ARKIT.index("mouthRight")]) > 0.2
+
+
+def test_what_is_infinite_is_what_nobody_saw(solver: WebcamSolver, person: Tensor) -> None:
+    shown = seen(solver, person, weights_of(jawOpen=0.5), (0.0, 0.0, 0.0))
+    both = []
+    for unknown in (torch.nan, torch.inf):
+        marks, nothing = shown.landmarks.clone(), torch.full((2,), unknown)
+        marks[30, 0] = unknown
+        given = replace(shown, landmarks=marks, iris=nothing.repeat(2, 1), openness=nothing, closed=nothing)
+        both.append(solver.step(solver.start(), given, 1 / FPS).pack())
+    assert bool(both[1].isfinite().all())
+    assert torch.equal(*both)
+
+
+def test_inputs_of_another_kind_or_shape_are_refused(solver: WebcamSolver) -> None:
+    reading = [getattr(NO_FACE, name) for name in READ_FOR_SOLVER]
+    rest = [torch.tensor([640.0, 480.0]), torch.tensor(0.1), WebcamControls().tensor(), solver.start().pack()]
+    assert bool(solver(*reading, *rest).isfinite().all())
+    with pytest.raises(ArgumentTypeError, match=r"landmarks: found a list of list, expected a Tensor"):
+        solver(reading[0].tolist(), *reading[1:], *rest)
+    for row in range(13):
+        given = [*reading, *rest]
+        given[row] = given[row][..., :-1] if given[row].ndim else given[row][None]
+        with pytest.raises(ShapeError, match=r"webcam solver: found \w+ \([\d, ]+\), expected \([\d, ]*\)"):
+            solver(*given)

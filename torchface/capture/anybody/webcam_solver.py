@@ -25,9 +25,11 @@ from torchface.capture.own_rig.weight_walk import (
     walk_information,
 )
 from torchface.capture.weight_readings import doubted_blinks
+from torchface.errors import ShapeError
 from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
 from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
 from torchface.landmarks.images.face_reading import LEAST_VISIBLE, READ_FOR_SOLVER, FaceReading, trust_of
+from torchface.number_checks import checked_type
 from torchface.optim.exported_operators import symmetric_inverse
 from torchface.optim.full_precision import full_precision
 
@@ -39,6 +41,13 @@ _SHORTEST, _LONGEST = 1e-3, 0.5  # seconds
 _SETTLED = 0.15  # seconds after which the pose of a face that has just appeared has come to rest
 _UNKNOWN, _FADE = 5.0, 0.4  # how much more sparse a face is that nothing is known of, and for how long, seconds
 _EAGER, _EAGER_FOR = 3.0, 0.7  # how much more the first frames of a person count, and for how long, seconds
+
+
+_INPUTS: dict[str, tuple[int, ...]] = {
+    "landmarks": (68, 2), "deviation": (68,), "visibility": (68,), "presence": (), "iris": (2, 2), "openness": (2,),
+    "closed": (2,), "eye_visibility": (2,), "expression": (52,), "expression_deviation": (52,), "size": (2,),
+    "interval": (), "controls": (5,),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,13 +154,25 @@ class WebcamSolver(WebcamSolverParts):
         controls: Tensor,
         state: Tensor,
     ) -> Tensor:
-        """The next state's vector (S,), of a ``FaceReading``, ``step``'s other arguments and the state's vector."""
+        """The next state's vector (S,), of a ``FaceReading``, ``step``'s other arguments and the state's vector.
+
+        Raises:
+            ArgumentTypeError, ShapeError: an input is no tensor, or of another shape than one face in one picture has.
+        """
+        given = (landmarks, deviation, visibility, presence, iris, openness, closed, eye_visibility, expression)
+        given += (expression_deviation, size, interval, controls)
+        for value, (name, shape) in zip(given, _INPUTS.items(), strict=True):
+            if checked_type(name, value, Tensor).shape != shape:
+                raise ShapeError(f"webcam solver: found {name} {tuple(value.shape)}, expected {shape}")
+        landmarks, iris, openness, closed, expression = (
+            torch.where(x.isinf(), torch.nan, x.double()) for x in (landmarks, iris, openness, closed, expression)
+        )
         pose, gain, smoothing, reset, freeze = controls.double()
         before = self.layout.unpack(torch.where(reset > 0, 0.0, _known(state, 0.0))).double()
         interval = _known(interval.double(), _SHORTEST).clamp(_SHORTEST, _LONGEST)
         focal = size.double().max() / (2 * math.tan(math.radians(ASSUMED_FIELD_OF_VIEW) / 2))
         centre = 0.5 * (size.double() - 1)
-        rays, iris_rays = (landmarks.double() - centre) / focal, (iris.double() - centre) / focal
+        rays, iris_rays = (landmarks - centre) / focal, (iris - centre) / focal
         visible = ~torch.isnan(rays).any(1)
         present = _known(presence.double(), 0.0) * (visible.double().sum() >= LEAST_VISIBLE)
         trust = trust_of(self.landmark_weights * visible, _known(visibility.double(), 1.0).clamp(0, 1))
@@ -161,9 +182,9 @@ class WebcamSolver(WebcamSolverParts):
             torch.where(visible[:, None] & shows_face, rays, self.person.rest[:LANDMARKS, :2] * self.upright),
             torch.where(shows_face, trust, 1.0),
             _known(deviation.double(), 0.0).clamp(0, 1e3) / focal,
-            (expression.double(), expression_deviation.double()),
+            (expression, expression_deviation.double()),
             iris_rays,
-            EyesRead(openness.double(), closed.double(), eye_visibility.double()),
+            EyesRead(openness, closed, eye_visibility.double()),
             interval,
             pose,
             (freeze <= 0).double(),

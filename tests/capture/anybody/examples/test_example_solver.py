@@ -234,6 +234,7 @@ def test_mistakes_are_said(examples: ExampleShapes) -> None:
         solver(torch.stack([examples.neutral, torch.full((68, 2), torch.nan)]))
     with pytest.raises(ValueRangeError, match="infinite in frames"):
         solver(torch.full((1, 68, 2), torch.inf))
+    assert torch.equal(solver(examples.neutral[None].tolist()), solver(examples.neutral[None]))
     with pytest.raises(ValueRangeError, match="all the neutral"):
         ExampleSolver(replace(examples, landmarks=examples.neutral.expand(15, -1, -1)))
     with pytest.raises(ValueRangeError, match="sparsity"):

@@ -20,7 +20,7 @@ from torchface.capture.anybody.examples.landmark_placement import (
 )
 from torchface.capture.weight_observability import Observability, weight_observability
 from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
-from torchface.number_checks import checked_type
+from torchface.number_checks import as_real, checked_type
 from torchface.optim.data_dependent import data_dependent
 
 _METHODS = {"all_at_once": AllAtOnce, "regional": Regional}
@@ -180,6 +180,7 @@ class ExampleSolver(nn.Module):
             ShapeError: ``landmarks`` is not (B,68,2), or ``initial`` not (B,N).
             ValueRangeError: a coordinate is infinite, or frames show fewer than six landmarks.
         """
+        landmarks = as_real(landmarks, "landmarks")
         self._check(landmarks, initial)
         equations = self.equations(landmarks)
         unknowns = self.method.solve(equations, self.regions, None if initial is None else initial.double())
