@@ -59,7 +59,7 @@ def test_a_csv_holds_the_weights_or_the_one_track_there_is(tmp_path: Path) -> No
 def test_what_no_reader_knows_is_refused(tmp_path: Path) -> None:
     with pytest.raises(FileFormatError, match=r"take\.fbx: found the ending '\.fbx', expected \.c3d, \.trc, \.csv"):
         load_take(tmp_path / "take.fbx")
-    with pytest.raises(FileFormatError, match=r"take\.glb: found .*torchface\.load_animation reads \.glb"):
+    with pytest.raises(FileFormatError, match=r"take\.glb: found .*torchface\.io\.load_animation reads \.glb"):
         load_take(tmp_path / "take.glb")
     with pytest.raises(FileFormatError, match=r"take\.fbx: found the ending"):
         save_take(Take(60.0, markers=_markers()), tmp_path / "take.fbx")

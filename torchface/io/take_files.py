@@ -75,7 +75,7 @@ def load_take(path: str | Path, unit: str | None = None, fps: float | None = Non
         (25.0, ('jawOpen', 'mouthPucker'), [0.5, 0.0])
     """
     checked_path("path", path)
-    check_ending(path, *TAKE_ENDINGS, *RECORDING_ENDINGS, hint="; torchface.load_animation reads .glb, .gltf and USD")
+    check_ending(path, *TAKE_ENDINGS, *RECORDING_ENDINGS, hint="; torchface.io.load_animation reads .glb, .gltf, USD")
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".c3d":
