@@ -222,6 +222,7 @@ def export_app(
     out: Annotated[Path, Output(("character.glb",))],
     character: Path | None = None,
     webcam: Path | None = None,
+    mapping: Path | None = None,
     quiet: Quiet = False,
 ) -> None:
     """Write the app in the browser: a folder that any static host serves, in which a webcam moves a character.
@@ -234,11 +235,12 @@ def export_app(
         out: The folder to write; an earlier app in it is replaced.
         character: A .glb, or another rig, whose shapes have ARKit's names; the embedded performer if absent.
         webcam: The graph from picture to weights, as `torchface export webcam` writes it; that one if absent.
+        mapping: For shapes by other names: a mapping table, TOML, as `torchface retarget` takes it.
     """
     from torchface.workflows.browser_app import export_app as write
 
     with progress_bars(quiet) as progress:
-        report = write(out, character, webcam, progress)
+        report = write(out, character, webcam, progress, mapping)
     print_table(report.rows())
     if report.still:
         console.print(f"no face moves {', '.join(report.still)}", soft_wrap=True)

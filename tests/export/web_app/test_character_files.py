@@ -20,6 +20,7 @@ from test_vrm_in_browser import browser as vrm_browser  # noqa: F401  (three-vrm
 from planted.characters import Planted, write_character
 from planted.glb_files import rewrite
 from torchface import BlendshapeRig, load_rig, load_take, save_rig
+from torchface.errors import NameMismatchError
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.gltf.gltf_document import read_document
@@ -397,12 +398,21 @@ def test_shapes_that_move_nothing_are_named(tmp_path: Path) -> None:
     assert load_character(tmp_path / "two.glb").still == ("tongueOut",)
 
 
-def test_the_tongue_is_not_counted_among_what_a_face_moves(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_app_takes_a_mapping_and_does_not_count_the_tongue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "page" / "assets").mkdir(parents=True)
-    (tmp_path / "page" / "assets" / "page.js").write_text("page")
+    for name in ("index.html", "assets/page.js"):
+        (tmp_path / "page" / name).write_text("page")
     monkeypatch.setattr(app_folder, "built_page", lambda progress: tmp_path / "page")
     write_planted_graph(tmp_path / "planted.onnx")
     path = sheet(tmp_path / "sheet.glb", ("jawOpen", "Tongue_Out", "antenna"))
     report = app_folder.export_app(tmp_path / "app", path, tmp_path / "planted.onnx")
     assert (report.driven, report.still) == (("jawOpen",), ("Tongue_Out", "antenna"))
     assert ("shapes that a face moves", "1 of 3") in report.rows()
+    (tmp_path / "names.toml").write_text("[Maw]\nsum = {jawOpen = 0.5}\n[Tip]\nsum = {tongueOut = 1}\n")
+    own = sheet(tmp_path / "own.glb", ("Maw", "Tip"))
+    with pytest.raises(NameMismatchError, match="or --mapping FILE"):
+        app_folder.export_app(tmp_path / "app", own, tmp_path / "planted.onnx")
+    planted, names = tmp_path / "planted.onnx", tmp_path / "names.toml"
+    assert app_folder.export_app(tmp_path / "app", own, planted, mapping=names).driven == ("Maw",)
+    rows = json.loads((tmp_path / "app" / "character.json").read_text())["sources"]
+    assert rows["Maw"] == [[ARKIT.index("jawOpen"), 0.5]]

@@ -64,6 +64,7 @@ def export_app(
     character: str | Path | None = None,
     webcam: str | Path | None = None,
     progress: Progress | None = None,
+    mapping: str | Path | None = None,
 ) -> AppReport:
     """Writes a folder that any static host serves: a page in which a webcam moves a character, on the user's machine.
 
@@ -74,6 +75,7 @@ def export_app(
         webcam: the graph from picture to weights, as ``torchface export webcam`` writes it; made, or taken from the
             cache, if absent.
         progress: called with each step.
+        mapping: a table (``load_shape_rules``) for shapes of other names than ARKit's.
 
     Raises:
         FileFormatError: the character or the graph cannot be read, the character is too large, or the folder holds
@@ -85,7 +87,7 @@ def export_app(
     check_writable(folder=out)
     _check_folder(out)
     progress("reading the character")
-    shown = load_character(character, progress=progress)
+    shown = load_character(character, None if mapping is None else Path(mapping), progress)
     graph = page_graph(webcam_graph(progress) if webcam is None else read_file(webcam), webcam or "the webcam's graph")
     files = {GRAPH: packed_numbers(graph), CHARACTER: shown.data, TABLE: shown.page_table()}
     page = built_page(progress)
