@@ -39,6 +39,8 @@ def test_combination_shapes_are_driven_by_products() -> None:
     shapes = shape_map(base, [*base, "jawOpen_mouthSmileLeft", "jawOpen+mouthSmileLeft+mouthSmileRight"])
     w = torch.tensor([[0.5, 0.4, 0.2]])
     assert shapes(w)[0, 3:].tolist() == pytest.approx([0.2, 0.04])
+    sided = shape_map(base, ["jawOpen_mouthSmile_L", "mouthSmile_Left_mouthSmile_R_jawOpen"])
+    assert sided(w)[0].tolist() == pytest.approx([0.2, 0.04])
     assert shapes.undriven == ()
 
 

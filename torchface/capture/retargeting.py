@@ -1,6 +1,7 @@
 """One rig's weights on another: parallel parameterisation, by names and by a mapping table."""
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -286,8 +287,8 @@ def _check_rules(rules: Mapping[str, ShapeRule], from_names: Sequence[str], to_n
 
 def _combination(name: str, from_names: Sequence[str]) -> tuple[int, ...]:
     """The source shapes whose names a combination shape's name joins; none if it joins no others."""
-    for joint in ("+", "_"):
-        parts = name.split(joint)
+    for joint in (r"\+", r"_(?!(?:l|r|left|right)(?:_|$))"):  # a side belongs to the name before it
+        parts = re.split(joint, name, flags=re.IGNORECASE)
         if not 2 <= len(parts) <= _MAX_FACTORS or not all(parts):
             continue
         matches = mapping(from_names, parts)
