@@ -12,7 +12,7 @@ from planted.glb_files import unpacked
 from torchface import BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.cli import main
 from torchface.errors import NameMismatchError
-from torchface.io import load_animation, load_image
+from torchface.io import load_animation, load_image, save_animation
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.synthetic import performer
 from torchface.workflows.retarget_weights import retarget_weights
@@ -57,7 +57,22 @@ def test_most_shapes_without_a_name_on_the_target_are_counted(tmp_path: Path) ->
     names = ("jawOpen", "Maw", "Snout", "Horns")
     save_take(Take(60.0, weights=Track(names, torch.tensor([[0.5, 0.5, 0.5, 0.0]])[..., None])), tmp_path / "take.csv")
     done = retarget_weights(tmp_path / "take.csv", tmp_path / "rig.glb", WeightFiles(tmp_path / "out.csv"))
-    assert any("only 1 of the 3 shapes that move in" in warning for warning in done.warnings)
+    said = f"only 1 of the 3 shapes that move in {tmp_path / 'take.csv'} drive a shape of {tmp_path / 'rig.glb'}: "
+    assert any(warning.startswith(said) for warning in done.warnings)
+
+
+def test_the_rotations_that_are_not_read_from_an_animated_rig_are_said(tmp_path: Path) -> None:
+    rig = performer(texture=False).select(["jawOpen"])
+    save_rig(rig, tmp_path / "rig.glb")
+    take = Take(60.0, weights=Track(("jawOpen",), torch.full((2, 1, 1), 0.5)))
+    save_animation(rig, take, tmp_path / "take.glb")
+    save_take(take, tmp_path / "take.csv")
+    notes = [
+        retarget_weights(tmp_path / name, tmp_path / "rig.glb", WeightFiles(tmp_path / "out.csv")).notes
+        for name in ("take.glb", "take.csv")
+    ]
+    glb = tmp_path / "take.glb"
+    assert notes == [(f"{glb}: the weights of its shapes are read, not how its head and eyes turn",), ()]
 
 
 def test_action_units_of_openface_move_a_rig_and_those_without_a_shape_are_named(

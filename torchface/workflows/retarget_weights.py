@@ -19,6 +19,7 @@ from torchface.capture.retargeting import ShapeMap, load_shape_rules, retarget_t
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.files.whole_files import make_folder
 from torchface.io import load_rig
+from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
@@ -80,10 +81,12 @@ def retarget_weights(
         played = replace(played, weights=Track(rig.names, rig.weights_from(played.weights)[..., None]))
     assert played.weights is not None
     said: tuple[str, ...] = ()
+    if weights.suffix.lower() in SCENE_ENDINGS:
+        said = (f"{weights}: the weights of its shapes are read, not how its head and eyes turn",)
     rules = {} if table is None else load_shape_rules(table)
     if poses is not None:
-        learned, said = _learned(poses, played.weights.names, target, files.out)
-        rules, faults = learned.rules | rules, [*faults, *learned.notes]
+        learned, told = _learned(poses, played.weights.names, target, files.out)
+        rules, faults, said = learned.rules | rules, [*faults, *learned.notes], (*said, *told)
     try:
         shapes = shape_map(played.weights.names, target.names, rules)
     except NameMismatchError as error:
@@ -112,8 +115,8 @@ def _unmatched(weights: Track, shapes: ShapeMap, source: Path, target: Path) -> 
     if 2 * len(lost) <= len(moving):
         return []
     return [
-        f"only {len(moving) - len(lost)} of the {len(moving)} shapes that move in {source} have a name that {target} "
-        "has: the others are lost; give a table of names (--table) or example poses (--poses)"
+        f"only {len(moving) - len(lost)} of the {len(moving)} shapes that move in {source} drive a shape of {target}: "
+        "the others are lost; names, a table (--table) or example poses (--poses) say what drives what"
     ]
 
 
