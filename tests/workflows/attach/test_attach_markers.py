@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from torchface import Attachment, BlendshapeRig, Take, Track
+from torchface.capture.markers.attachment.initial_sites import sites_by_shape
 from torchface.errors import AlignmentError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io import save_rig, save_take
@@ -61,6 +62,16 @@ def test_markers_of_the_helmet_are_named_and_those_of_the_face_are_not(
     assert helmet_markers(fit, whole, whole) == names
     alone, _ = cleaned_fit(dome_rig, take, sites, standoff=False, free_scale=False)
     assert helmet_markers(alone, take, take) == []
+
+
+def test_markers_on_a_dome_are_found_on_it_by_their_shape(
+    dome_rig: BlendshapeRig, motion: tuple[Attachment, Take]
+) -> None:
+    """No turn about the dome's axis and no size is determined: markers must not slide over its border."""
+    sites, take = motion
+    faces, rest = dome_rig.neutral.faces, dome_rig.vertices
+    found = sites_by_shape(dome_rig, take)
+    assert (found.on(faces, rest) - sites.on(faces, rest)).norm(dim=1).median() < 15
 
 
 @pytest.mark.parametrize(

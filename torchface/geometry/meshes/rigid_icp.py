@@ -16,7 +16,7 @@ _SEED = 0
 _ROTATIONS = 400
 _LANDMARK_WEIGHT = 20.0
 _DAMPING = 1e-6
-_LEAST_FIT = 0.35
+_LEAST_FIT, _SLID_OFF = 0.35, 0.9
 _SCAN_POINTS = 20_000
 
 
@@ -161,11 +161,16 @@ def find_pose(samples: Samples, scan: ScanPoints, size: float = 1.0) -> Fit:
     middle = (scan.points.amax(0) + scan.points.amin(0)) / 2
     own = (samples.points.amax(0) + samples.points.amin(0)) / 2
     start = Similarity(sizes, all_rotations, middle - size * (all_rotations @ own))
+    most = Fit(start, start.scale)
     for first, reaches, half, kept, slack in _SEARCH:
+        start = most.pose
         some, scale, early = samples.first(first), slack == 0, len(reaches) // 3 + 1
         left = rigid_icp(some, scan, start, reaches[:early], scale, slack=slack).best(half)
         most = rigid_icp(some, scan, left.pose, reaches[early:], scale, slack=slack).best(kept)
-        start = most.pose
+    # Few points of a surface near a sphere determine no size: it shrinks until they leave the surface.
+    before = Fit(start, fit_of(some, scan, start, reaches[-1])).best(1)
+    if float(most.fit[0]) < _SLID_OFF * float(before.fit[0]):
+        most = before
     if float(most.fit[0]) < _LEAST_FIT:
         raise AlignmentError(
             f"found no pose that fits (best fit {float(most.fit[0]):.2f} of 1, expected at least {_LEAST_FIT})"
