@@ -12,6 +12,7 @@ from torchface import load_rig, zoo
 from torchface.errors import AlignmentError
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io import load_identity_modes, load_image, save_image
+from torchface.io.video import open_video
 from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
@@ -129,6 +130,18 @@ def test_landmarks_of_another_photograph_make_a_poor_result(data: Path, tmp_path
     made = fit_photographs([folder / "lfpw_2.png"], [folder / "lfpw_1.pts"], None, tmp_path / "rig.glb", settings)
     assert made.verdict().startswith("result: poor, the given landmarks are not on a face")
     assert "no face where the given landmarks lie, but 1 elsewhere" in " ".join(made.remarks)
+
+
+@pytest.mark.real
+def test_a_smile_does_not_make_another_person(data: Path, tmp_path: Path) -> None:
+    """A man at rest and smiling in one film had probabilities of 7 % by form, and 42 % with colours."""
+    frames = dict(enumerate(open_video(data / "video" / "single_face.mp4").color_frames()))
+    photographs = [tmp_path / "rest.png", tmp_path / "smile.png"]
+    for path, number in zip(photographs, (4, 54), strict=True):
+        save_image(frames[number] / 255, path)
+    settings = PhotographSettings(fit=FitSettings(texture_size=0))
+    made = fit_photographs(photographs, [], "head", tmp_path / "rig.glb", settings)
+    assert not any("different people" in line for line in made.remarks), made.remarks
 
 
 def test_exact_landmarks_of_one_head_are_of_one_person() -> None:

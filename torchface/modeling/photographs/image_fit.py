@@ -52,8 +52,7 @@ class ImageFit:
         residuals: where the fit's landmarks are seen minus where they were found, (I,68,2), pixels, NaN for missing.
         landmarks: where the fit's landmarks are seen, (I,68,2), pixels.
         noise: estimated deviation of an inner landmark, pixels of a photograph of mean size.
-        covariance: of coefficients and weights of each expression, (K+EN,K+EN); rows of those that lie on their
-            bound are zero.
+        covariance: of coefficients and weights of each expression, (K+EN,K+EN).
         color: the colour model's fit to the photographs; None without one, or without photographs.
         hair: its colour, (3,); None where photographs show a bald head.
         iris: the irises' colour, (3,); None where no photograph shows it.

@@ -200,26 +200,26 @@ def _spreads(problem: Problem, state: State, picked: PickedPoints, factors: Whit
 
 
 def covariance(problem: Problem, state: State) -> Tensor:
-    r"""Of the coefficients' errors, (D,D), cameras unknown; rows of those that lie on a bound are zero.
+    r"""Of the coefficients' errors, (D,D), cameras unknown.
 
     .. math:: (H + P)^{-1} (s^2 H + P P_0^{-1} P) (H + P)^{-1}
 
     with the precision P of the prior as the solve weighs it, P_0 that true coefficients have, and errors of points s
-    times as large along heads' forms as the solve, of normal matrix H, takes them to be.
+    times as large along heads' forms as the solve, of normal matrix H, takes them to be. What lies on a bound is as
+    wide as an exponential distribution that falls as steeply as the posterior there: a shape that a photograph seems
+    not to show is not known to be absent.
     """
     picked = problem.points.picked(state.rows)
     factors = whitening(problem, state, picked)
     at = linearised(picked, state.coefficients[problem.rows], state.views, problem.targets, factors)
-    precision, _ = problem.prior(state)
-    H = normal_equations(problem, at, state.views).H
+    precision, linear = problem.prior(state)
+    normal = normal_equations(problem, at, state.views)
     along = 1.0 if problem.settings.surface is None else _ALONG_FORMS
     weighed = precision.clone()  # P P_0^{-1} P
     weighed.diagonal()[: problem.identities] *= problem.identity_precision
     lower, upper = problem.bounds()
     x = state.coefficients
-    inside = ((x > lower + 1e-9) & (x < upper - 1e-9)).nonzero()[:, 0]
-    H, precision, weighed = (one[inside[:, None], inside] for one in (H, precision, weighed))
-    back = torch.linalg.inv(H + precision)
-    result = torch.zeros(len(x), len(x), dtype=torch.float64)
-    result[inside[:, None], inside] = back @ (along**2 * H + weighed) @ back
-    return result
+    slope = normal.g + precision @ x + linear
+    steep = torch.where((x > lower + 1e-9) & (x < upper - 1e-9), 0.0, (slope / along**2).square()).diag()
+    back = torch.linalg.inv(normal.H + precision + steep)
+    return back @ (along**2 * normal.H + weighed + steep) @ back
