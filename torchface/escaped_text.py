@@ -2,6 +2,7 @@
 
 import html
 import re
+from collections.abc import Iterable
 
 # C0 but for tab and line feed, DEL, C1, marks that change a line's direction, line separators, halves of surrogates.
 _HARMFUL = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069\ud800-\udfff]")
@@ -20,3 +21,14 @@ def visible(text: str) -> str:
 def as_markup(text: str) -> str:
     """The visible text for a page: as it is, not as markup."""
     return html.escape(visible(text))
+
+
+def listed(names: Iterable[str], limit: int = 8) -> str:
+    """The first names, and how many more there are.
+
+    Example:
+        >>> listed("abcd", limit=2)
+        'a, b and 2 more'
+    """
+    names = list(names)
+    return ", ".join(names[:limit]) + (f" and {len(names) - limit} more" if len(names) > limit else "")

@@ -6,8 +6,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from torchface.escaped_text import listed
+
 # What a report prints of each confusion, and how many of them; the tuples hold all.
-_SHOWN_SHAPES, _SHOWN_CONFUSIONS, _SHOWN_NAMES = 4, 8, 12
+_SHOWN_SHAPES, _SHOWN_CONFUSIONS = 4, 8
 
 
 @dataclass(frozen=True)
@@ -70,20 +72,15 @@ class Observability:
             f"{self.noise:g} {self.unit}; rank {self.rank}, condition {self.condition:.3g}",
         ]
         if self.unseen:
-            lines.append(f"not seen: {_first(self.unseen)}")
+            lines.append(f"not seen: {listed(self.unseen, 12)}")
         if self.ambiguous:
-            lines.append(f"cannot be distinguished from the other shapes: {_first(self.ambiguous)}")
+            lines.append(f"cannot be distinguished from the other shapes: {listed(self.ambiguous, 12)}")
         if self.confusions:
             lines.append("changes of the weights that do not show:")
             lines.extend(f"  {confusion}" for confusion in self.confusions[:_SHOWN_CONFUSIONS])
         if len(self.confusions) > _SHOWN_CONFUSIONS:
             lines.append(f"  and {len(self.confusions) - _SHOWN_CONFUSIONS} more")
         return "\n".join(lines)
-
-
-def _first(names: Sequence[str]) -> str:
-    more = len(names) - _SHOWN_NAMES
-    return ", ".join(names[:_SHOWN_NAMES]) + (f" and {more} more" if more > 0 else "")
 
 
 def weight_observability(

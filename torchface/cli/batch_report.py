@@ -14,6 +14,7 @@ from tyro.conf import arg
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import console, print_path
 from torchface.errors import AlignmentError
+from torchface.escaped_text import listed
 
 if TYPE_CHECKING:
     from torchface.workflows.batch.batch_items import ItemKind
@@ -140,8 +141,8 @@ def _verdict(done: Sequence[Outcome]) -> str:
     parts = []
     for word in ranked:
         names = words[word]
-        listed = ", ".join(names[:_MAX_ROWS]) + (f" and {len(names) - _MAX_ROWS} more" * (len(names) > _MAX_ROWS))
-        parts.append(word if len(done) == 1 else f"{len(names)} {word}" + (f" ({listed})" * (word != "good")))
+        which = f" ({listed(names, _MAX_ROWS)})" if word != "good" else ""
+        parts.append(word if len(done) == 1 else f"{len(names)} {word}{which}")
     return f"result: {', '.join(parts)}" if parts else ""
 
 

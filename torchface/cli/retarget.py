@@ -8,8 +8,7 @@ from tyro.conf import Positional, arg
 from torchface.cli.command_options import OptionalOutputPath, OutputPath, Reduce
 from torchface.cli.progress_bars import progress_bars
 from torchface.cli.terminal import Quiet, console, print_lines, print_path
-
-_MAX_NAMES = 12
+from torchface.escaped_text import listed
 
 
 def retarget(
@@ -64,8 +63,7 @@ def retarget(
         ("has no motion in the target:", done.still),
     ):
         if names:
-            more = f" and {len(names) - _MAX_NAMES} more" if len(names) > _MAX_NAMES else ""
-            console.print(f"{what} {', '.join(names[:_MAX_NAMES])}{more}", highlight=False)
+            console.print(f"{what} {listed(names, 12)}", highlight=False)
     print_lines(done.notes)
     print_lines(f"warning: {warning}" for warning in done.warnings)
     for path in (out, animation, live_link):

@@ -18,6 +18,7 @@ from torchface.capture.markers.hybrid_solver import GAMMA, HybridSolver
 from torchface.capture.markers.marker_solver import MarkerSolver, penalty_value
 from torchface.capture.markers.observability import observability
 from torchface.errors import ValueRangeError
+from torchface.escaped_text import listed
 from torchface.files.whole_files import write_file
 from torchface.landmarks.images.graph_session import graph_session
 from torchface.number_checks import checked_count
@@ -37,7 +38,6 @@ _USUAL = 1e-3  # of the energy: 0.0003 mm of a marker error of 0.5 mm
 # Two runs that round differently may lie a few times as far from each other as one does from the exact sum; a graph
 # that computes something else lies much farther.
 _ROUNDINGS = 10.0
-_SHOWN = 8
 _FAR = 0.05  # of a weight from the exact solve's: seen in an animation
 _TEST_FRAMES, _CORRECTIVE_FRAMES = 512, 48
 _FRAMES_A_POSE = 10
@@ -97,10 +97,8 @@ class SolverReport(WrittenGraph):
         if far > _FAR:
             found += f"; weights lie up to {far:.2f} from the exact solve's"
         if far > _FAR and self.mixed:
-            shown = ", ".join(self.mixed[:_SHOWN]) + (
-                f" and {len(self.mixed) - _SHOWN} more" * (len(self.mixed) > _SHOWN)
-            )
-            found += f", as the markers do not distinguish {shown} from one another: leave out what others add up to"
+            mixed = listed(self.mixed)
+            found += f", as the markers do not distinguish {mixed} from one another: leave out what others add up to"
         if worst > _USUAL or far > _FAR:
             return f"result: poor, {found}; more steps bring it nearer (GraphSteps in Python), or the other --method"
         return f"result: good, {found}, and ONNX Runtime gives the weights that PyTorch gives"

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.errors import FileFormatError
+from torchface.escaped_text import listed
 from torchface.files.models import DESCRIPTION
 from torchface.files.whole_files import check_there, read_file
 from torchface.geometry.cameras.calibration import CameraCalibration
@@ -54,7 +55,7 @@ Rows = list[tuple[str, str]]
 
 _MAX_LENGTH = 240
 _LENGTH, _LONGEST_HEADER = "_mm", 4096  # ends the names of columns that are no weights
-_MAX_NAMED, _MAX_LISTED = 8, 10
+_MAX_NAMED = 8
 _STILL = 1e-5  # of a head's extent; by no more a shape moves nothing
 _ALIKE = 0.01  # of a shape's motion: by no more its vertices differ where it moves the whole mesh
 _LANDMARK_ENDINGS = (".ljson", ".pts", ".xml")
@@ -362,9 +363,7 @@ def _graph_rows(path: Path) -> Rows:
 
 
 def _named(names: Sequence[str]) -> str:
-    """How many, and what the first are called."""
-    more = f" and {len(names) - _MAX_LISTED} more" if len(names) > _MAX_LISTED else ""
-    return f"{len(names)}: {', '.join(names[:_MAX_LISTED])}{more}"
+    return f"{len(names)}: {listed(names, 10)}"
 
 
 def _shortened(text: str) -> str:

@@ -13,6 +13,7 @@ from torchface.attachment import Attachment
 from torchface.capture.markers import match_labels, own_labels
 from torchface.capture.markers.rig_fit_check import unit_of_scale
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.escaped_text import listed
 from torchface.geometry.similarity import MAX_HEAD_SCALE, MIN_HEAD_SCALE
 from torchface.io import load_take
 from torchface.io.markers.marker_csv import is_marker_header
@@ -25,7 +26,6 @@ from torchface.workflows.batch.batch_items import ItemKind
 # 0.0024; with markers 2 mm off the skin 0.988, with two labels exchanged in 9 % of the frames 1 within 0.0015.
 MAX_SCALE_DIFFERENCE = 0.01  # a take of the rig's own performer in true units fits it at scale 1, within this
 
-_SHOWN = 6
 _AXES = "xyz"
 _SPAN = re.compile(r"\s*(\d{0,9})\s*:\s*(\d{0,9})\s*")
 
@@ -120,8 +120,7 @@ def read_range_of_motion(
     labels = [name for name, shown in zip(take.markers.names, seen, strict=True) if shown]
     unseen = [name for name in (take.markers.names if initial is None else initial.labels or ()) if name not in labels]
     if unseen:
-        more = f" and {len(unseen) - _SHOWN} more" if len(unseen) > _SHOWN else ""
-        notes.append(f"no site for {', '.join(unseen[:_SHOWN])}{more}: seen in no frame")
+        notes.append(f"no site for {listed(unseen)}: seen in no frame")
     sites = None if initial is None else initial.select(labels)
     return replace(take, markers=take.markers.select(labels)), sites, notes
 

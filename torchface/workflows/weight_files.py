@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchface.capture.own_rig.eye_geometry import Eyeballs
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.escaped_text import listed
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder, write_file
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.performance_animation import Performance, performed_glb
@@ -27,7 +28,6 @@ from torchface.temporal.interpolation import values_at
 from torchface.temporal.key_reduction import KeyReduction, kept_keys, reduction_error
 from torchface.workflows.head_rotations import still_head_columns
 
-_SHOWN = 8
 _KEPT = (".glb", ".vrm")  # rigs' files that are written again with all that they have
 _SEEN = 0.01  # of a weight: less moves nothing that is seen
 _ROUNDED = 1e-3  # what a file's rounding leaves beyond 0 or 1
@@ -113,11 +113,10 @@ def weight_faults(weights: Track) -> list[str]:
             continue
         frame, channel = wrong.nonzero()[0].tolist()
         shapes = [weights.names[row] for row in wrong.any(0).nonzero()[:, 0].tolist()]
-        more = f" and {len(shapes) - _SHOWN} more" if len(shapes) > _SHOWN else ""
         first = "" if what == "missing" else f", {float(values[frame, channel]):g}"
         span = "" if what == "missing" else f" ({float(values[wrong].min()):.3g} to {float(values[wrong].max()):.3g})"
         lines.append(
-            f"{count} weights are {what}{span}, of {', '.join(shapes[:_SHOWN])}{more}; the first is "
+            f"{count} weights are {what}{span}, of {listed(shapes)}; the first is "
             f"{weights.names[channel]} in frame {frame}{first}"
         )
     return lines
@@ -167,9 +166,7 @@ def write_weights(
             make_folder(files.live_link.parent)
             save_live_link(with_eyes(few, rig), files.live_link)
     if lost and files.live_link is not None:
-        more = f" and {len(lost) - _SHOWN} more" if len(lost) > _SHOWN else ""
-        listed = ", ".join(lost[:_SHOWN]) + more
-        warnings.append(f"{files.live_link} does not give back (halves are merged, others left out): {listed}")
+        warnings.append(f"{files.live_link} does not give back (halves are merged, others left out): {listed(lost)}")
     if files.animation is not None:
         make_folder(files.animation.parent)
         whole, count = filled(take)

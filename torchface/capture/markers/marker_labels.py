@@ -2,10 +2,11 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from torchface.errors import NameMismatchError
+from torchface.escaped_text import listed
 
 _UNLABELLED = re.compile(r"\*\d*|un(label?led|named|known)[\s_*-]*\d*", re.IGNORECASE)
 _LEFT = re.compile(r"left|Left|LEFT|(?:^|(?<![A-Za-z])|(?<=[a-z]))L|(?:^|(?<![A-Za-z]))l|[Ll]$")
@@ -180,9 +181,3 @@ def _assign(assigned: dict[str, str], label: str, channel: str) -> None:
             "other out by a row without a second cell in a table (--labels map.csv; 'Actor:*,' for a whole subject)"
         )
     assigned[label] = channel
-
-
-def listed(names: Iterable[str]) -> str:
-    """The first six names, for messages."""
-    names = list(names)
-    return ", ".join(names[:6]) + (f" and {len(names) - 6} more" if len(names) > 6 else "")

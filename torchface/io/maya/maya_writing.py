@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from torchface.errors import FileFormatError, TopologyError
+from torchface.escaped_text import listed
 from torchface.files.whole_files import replaced_file
 from torchface.files.write_errors import unwritten
 from torchface.io.gltf.primitive_writing import MIN_MOVE
@@ -83,8 +84,7 @@ def maya_notes(rig: BlendshapeRig, keys: WeightKeys | None = None) -> list[str]:
     targets, notes = _targets(rig, Path("rig.ma")), []
     renamed = [f"{name!r} is {alias}" for name, alias in _renamed(rig, targets)]
     if renamed:
-        more = f" and {len(renamed) - 8} more" if len(renamed) > 8 else ""
-        notes.append(f".ma has other names for {len(renamed)} shapes: {', '.join(renamed[:8])}{more}")
+        notes.append(f".ma has other names for {len(renamed)} shapes: {listed(renamed)}")
     neutral = rig.neutral
     lost = {"the texture": neutral.texture, "vertex colours": neutral.colors, "annotations": neutral.annotations}
     if left := [what for what, value in lost.items() if value is not None]:

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from torchface.errors import FileFormatError, NameMismatchError
+from torchface.escaped_text import listed
 from torchface.files.whole_files import read_file, replaced_file
 
 _SEVERAL_HEADERS = {"format version": "OptiTrack Motive's", "trajectories": "Vicon's"}  # by their first cell
@@ -230,8 +231,7 @@ def parse_number(cell: str) -> float | None:
 
 def quoted(names: Sequence[str], limit: int = 5) -> str:
     """The first few, short enough for a message."""
-    listed = ", ".join(repr(name if len(name) <= 40 else name[:37] + "...") for name in names[:limit])
-    return listed + (f" and {len(names) - limit} more" if len(names) > limit else "")
+    return listed((repr(name if len(name) <= 40 else name[:37] + "...") for name in names), limit)
 
 
 def _escaped(name: str) -> str:

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from torchface.capture.markers import MeshSolution, MeshSolver
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
+from torchface.escaped_text import listed
 from torchface.files.documents import read_json
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder, write_file
 from torchface.geometry.similarity import Similarity
@@ -198,8 +199,8 @@ def _renamed(take: Take, path: Path, files: WeightFiles) -> list[str]:
     values = take.weights.values[..., 0] @ matrix.T
     arkit = replace(take, weights=Track(ARKIT, values[..., None]))
     write_weights(arkit, files, _no_rig())
-    left = f"; ARKit has no {', '.join(lost[:8])}" + (f" and {len(lost) - 8} more" if len(lost) > 8 else "")
-    return [f"{len(take)} frames of weights by name, {take.rate}{left if lost else ''}"]
+    left = f"; ARKit has no {listed(lost)}" if lost else ""
+    return [f"{len(take)} frames of weights by name, {take.rate}{left}"]
 
 
 def _no_rig() -> BlendshapeRig:

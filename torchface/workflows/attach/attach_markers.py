@@ -1,6 +1,5 @@
 """From a rig, a range-of-motion take and a first guess on disk to marker sites on disk."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from torchface.capture.markers.cleaning.label_swaps import find_swaps_by_shape, 
 from torchface.capture.markers.helmet_motion import steady_take
 from torchface.capture.markers.rest_pose import check_not_mirrored, inlier_markers
 from torchface.errors import AlignmentError, FileFormatError, ValueRangeError
+from torchface.escaped_text import listed
 from torchface.files.content_keys import content_key
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder
 from torchface.io import load_landmarks, load_rig
@@ -40,7 +40,6 @@ from torchface.workflows.marker_input import (
 MOTIONS = replace(MARKER_TAKES, done="attached")
 
 _METHOD = "attach batch/3"
-_SHOWN_NAMES = 8
 # A marker of which more is masked is not cleaned: what is wrong with it is said.
 _MAX_MASKED = 0.5
 # A common distance from the skin is advised where it leaves less than this part of the markers' error.
@@ -115,19 +114,14 @@ class AttachReport:
         ]
         lines = []
         if sites:
-            lines.append(f"sites that the take leaves uncertain, kept near the first guess: {_listed(sites)}")
+            lines.append(f"sites that the take leaves uncertain, kept near the first guess: {listed(sites)}")
         if shapes:
             lines.append(
-                f"shapes whose level the take leaves uncertain: {_listed(shapes)}; play them strongly, each by itself"
+                f"shapes whose level the take leaves uncertain: {listed(shapes)}; play them strongly, each by itself"
             )
         if uncertainty.unseen:
-            lines.append(f"shapes that these markers hardly see: {_listed(uncertainty.unseen)}")
+            lines.append(f"shapes that these markers hardly see: {listed(uncertainty.unseen)}")
         return lines
-
-
-def _listed(names: Sequence[str]) -> str:
-    more = f" and {len(names) - _SHOWN_NAMES} more" if len(names) > _SHOWN_NAMES else ""
-    return ", ".join(names[:_SHOWN_NAMES]) + more
 
 
 def load_sites(path: Path, mesh: Mesh, owner: str | Path = "the mesh") -> Attachment:
@@ -270,7 +264,7 @@ def attach(
         names = [name for name in fit.attachment.labels or () if name not in on_helmet]
         assert take.markers is not None
         take, start = replace(take, markers=take.markers.select(names)), start.select(names)
-        notes.append(f"left out {_listed(on_helmet)}: far from the skin and still, as markers of the helmet are")
+        notes.append(f"left out {listed(on_helmet)}: far from the skin and still, as markers of the helmet are")
         fit, cleanup = cleaned_fit(loaded, take, start, settings.standoff, progress, free_scale)
     free = fit.alignment
     if not free_scale:

@@ -7,6 +7,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.escaped_text import listed
 from torchface.evaluation import ShapeErrors, region_figures, rigidly_aligned, shape_errors, vertex_errors
 from torchface.files.job_lock import holds_out, within_job
 from torchface.files.whole_files import all_or_none
@@ -24,7 +25,7 @@ _SAME_RATE = 0.002
 _SAME_FRAME = 0.25  # of a frame by which times may differ
 _ROUNDED = 1e-6  # seconds
 _REACH = 0.4
-_MOVED, _NAMED = 0.01, 5  # a weight from which a shape moves; shapes that are named
+_MOVED = 0.01  # a weight from which a shape moves
 _GROUPS = ("round the jaw", "round the brows", "round the nose", "round the eyes", "round the mouth")
 _GROUP_OF_LANDMARK = (*[0] * 17, *[1] * 10, *[2] * 9, *[3] * 12, *[4] * 20)
 
@@ -264,8 +265,7 @@ def _absent(found: AnimatedMesh, true: AnimatedMesh) -> list[str]:
     moved = tracks[1].values[..., 0].nan_to_num().abs().amax(0) > _MOVED
     given = mapping(tracks[0].names, tracks[1].names).any(1)
     names = [name for name, absent in zip(tracks[1].names, (moved & ~given).tolist(), strict=True) if absent]
-    more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-    what = f"{found.path.name} has no {', '.join(names[:_NAMED])}{more}, which {true.path.name} moves: taken for 0"
+    what = f"{found.path.name} has no {listed(names)}, which {true.path.name} moves: taken for 0"
     return [what] if names else []
 
 

@@ -20,6 +20,7 @@ from torchface.capture import (
 from torchface.capture.markers import Cleanup, FitCheck, HelmetMotion
 from torchface.capture.markers.helmet_motion import steady_take
 from torchface.capture.markers.marker_solver import RIDGE, SPARSITY
+from torchface.escaped_text import listed
 from torchface.evaluation.mesh_errors import marker_offsets
 from torchface.geometry.similarity import Similarity
 from torchface.progress import Progress, silent
@@ -40,7 +41,6 @@ from torchface.workflows.solve.take_check import (
 _REALIGNED = 0.1
 _MOST = 0.8  # of the samples, below which a take shows too little
 _STRAY = 8.0  # times the median distance: noise stays below it, spikes and exchanged labels do not
-_SHOWN_SPANS = 6
 _SHOWN_DEFECTS = 12
 
 
@@ -287,6 +287,4 @@ def _frames(take: Take, rows: Tensor) -> str:
     breaks = (rows.diff() > 1).nonzero()[:, 0].tolist()
     firsts, lasts = [0, *(i + 1 for i in breaks)], [*breaks, len(rows) - 1]
     spans = [(int(rows[a]), int(rows[b])) for a, b in zip(firsts, lasts, strict=True)]
-    shown = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in spans[:_SHOWN_SPANS])
-    more = f" and {len(spans) - _SHOWN_SPANS} more stretches" if len(spans) > _SHOWN_SPANS else ""
-    return f"{len(rows)} frames ({shown}{more})"
+    return f"{len(rows)} frames ({listed(str(a) if a == b else f'{a}–{b}' for a, b in spans)})"

@@ -16,6 +16,7 @@ from torchface.capture.own_rig.head_pose import STABLE_LANDMARKS
 from torchface.capture.own_rig.landmark_offsets import LandmarkOffsets
 from torchface.capture.own_rig.take_eyes import TakeEyes
 from torchface.capture.own_rig.weight_walk import HIDDEN
+from torchface.escaped_text import listed
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.io.video import VideoFile
 from torchface.io.video.film_sound import sound_line
@@ -131,11 +132,10 @@ class Tracked:
         if self.outliers is None or not bool(self.outliers.any()):
             return []
         places = self.outliers.nonzero().tolist()
-        named = ", ".join(f"landmark {mark} of frame {frame}" for frame, mark in places[:_MAX_NAMED])
-        more = f" and {len(places) - _MAX_NAMED} more" if len(places) > _MAX_NAMED else ""
+        named = listed((f"landmark {mark} of frame {frame}" for frame, mark in places), _MAX_NAMED)
         frames = int(self.outliers.any(1).sum())
         return [
-            f"{len(places)} landmarks in {frames} frames lie where no face has them and were left out: {named}{more} "
+            f"{len(places)} landmarks in {frames} frames lie where no face has them and were left out: {named} "
             f"(landmarks.csv gives them a confidence of 0; {_FROM_ONE})"
         ]
 
@@ -295,10 +295,7 @@ class Tracked:
                 f"often at their maximum, 1: {named} of the frames; the face goes further than these shapes of {why}"
             )
         if unlearned := self.inputs.models.unlearned:
-            more = f" and {len(unlearned) - _MAX_NAMED} more" if len(unlearned) > _MAX_NAMED else ""
-            lines.append(
-                f"the priors have not learned {', '.join(unlearned[:_MAX_NAMED])}{more}: they hold these near rest"
-            )
+            lines.append(f"the priors have not learned {listed(unlearned)}: they hold these near rest")
         if self.reused:
             lines.append(f"landmarks of {self.reused} frames were known from an earlier run")
         if self.seconds:

@@ -12,11 +12,11 @@ from torchface.capture.markers.attachment.site_uncertainty import SiteUncertaint
 from torchface.capture.markers.frame_poses import MIN_MARKERS, rough_poses, solve_frames
 from torchface.capture.markers.given_markers import check_labels
 from torchface.capture.markers.helmet_motion import HelmetMotion
-from torchface.capture.markers.marker_labels import listed
 from torchface.capture.markers.rest_pose import check_not_collinear, check_not_mirrored, inlier_markers, pose_of_points
 from torchface.capture.markers.rig_fit_check import DOUBTFUL_SHARE
 from torchface.capture.markers.surface_motion import SurfaceMotion, with_one
 from torchface.errors import AlignmentError, ValueRangeError
+from torchface.escaped_text import listed
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.number_checks import checked_type
 from torchface.progress import Progress, silent

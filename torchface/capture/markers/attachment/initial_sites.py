@@ -4,11 +4,12 @@ import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.capture.markers.marker_labels import listed, sided_pairs
+from torchface.capture.markers.marker_labels import sided_pairs
 from torchface.capture.markers.rest_pose import check_not_collinear
 from torchface.capture.markers.rig_fit_check import unit_of_scale
 from torchface.capture.markers.surface_motion import SurfaceMotion
 from torchface.errors import AlignmentError, ValueRangeError
+from torchface.escaped_text import listed
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.rigid_icp import Samples, ScanPoints, find_pose
 from torchface.geometry.meshes.surface_index import SurfaceIndex
