@@ -1,10 +1,10 @@
-"""Hair as a cap: where it ends, and leaves that are none."""
+"""Hair as a cap: where it ends, and its colour."""
 
 import torch
 
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.landmarks.images.networks.part_network import PARTS
-from torchface.modeling.photographs.hair_cap import HairCap, _hair_color, _leaves, _white_hair
+from torchface.modeling.photographs.hair_cap import HairCap, _hair_color
 from torchface.modeling.photographs.skin_mask import FacePlaces
 from torchface.synthetic import neutral_head
 
@@ -20,17 +20,6 @@ def test_long_hair_goes_on_behind_the_ears_and_leaves_them_bare() -> None:
     assert float(torch.stack([short, long])[:, 2].min()) > 0.9
 
 
-def test_patches_beside_green_are_leaves_and_whole_hair_before_a_green_wall_is_hair() -> None:
-    green = torch.tensor([0.3, 0.4, 0.3])[:, None, None].expand(3, 40, 40)
-    skin = torch.zeros(40, 40)
-    skin[20:] = 1.0
-    patches = (torch.rand(40, 40, generator=torch.Generator().manual_seed(1)) < 0.5) & (skin == 0)
-    whole = (torch.arange(40)[:, None] > 8).expand(40, 40) & (skin == 0)
-    assert _leaves(green, patches, skin)
-    assert not _leaves(green, whole, skin)
-    assert not _leaves(green.mean(0, keepdim=True).expand(3, 40, 40), patches, skin)
-
-
 def test_hair_grows_thin_toward_an_uneven_edge() -> None:
     places = FacePlaces.of(neutral_head(texture=False))
     across, up = torch.linspace(-0.4, 0.4, 161, dtype=torch.float64), torch.linspace(0.3, 0.9, 601, dtype=torch.float64)
@@ -44,20 +33,6 @@ def test_hair_grows_thin_toward_an_uneven_edge() -> None:
     begins, ends = (((share < limit) * step).sum(1) for limit in (0.1, 0.9))
     assert float((ends - begins).mean()) > 0.05  # 5 mm from the last strands to whole hair
     assert float(begins.std()) > 0.015
-
-
-def test_white_hair_off_the_head_that_the_network_takes_for_skin_is_hair_and_a_face_behind_is_none() -> None:
-    shares = torch.zeros(len(PARTS), 60, 60)
-    shares[PARTS.index("hair")], shares[PARTS.index("skin")] = 0.3, 0.6
-    shown = FaceParts(shares, torch.eye(2, 3, dtype=torch.float64))
-    head = torch.tensor([[20.0, 20.0], [40.0, 20.0], [40.0, 50.0], [20.0, 50.0]])
-    white, skin = (
-        torch.tensor(color)[:, None, None].expand(3, 60, 60) for color in ((0.7, 0.7, 0.68), (0.7, 0.5, 0.4))
-    )
-    found = _white_hair(shown, white, head)
-    assert float(found[10, 10]) > 0.8
-    assert float(found[30, 30]) == 0
-    assert float(_white_hair(shown, skin, head).max()) == 0
 
 
 def test_hair_over_and_behind_the_ears_is_whole_where_its_line_falls_steeply() -> None:
@@ -84,7 +59,5 @@ def test_bluish_hair_is_grey_unless_it_is_dyed() -> None:
         shares[PARTS.index("hair"), :30] = 1.0
         points = torch.full((68, 2), 40.0, dtype=torch.float64)
         points[:, 0] = torch.linspace(15, 45, 68).double()
-        color = _hair_color(
-            [image], [FaceParts(shares, torch.eye(2, 3, dtype=torch.float64))], [points], [points], True
-        )
+        color = _hair_color([image], [FaceParts(shares, torch.eye(2, 3, dtype=torch.float64))], [points], True)
         assert (color - torch.tensor(found)).abs().max() < 0.01

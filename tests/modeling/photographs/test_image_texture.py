@@ -46,8 +46,6 @@ def test_irises_come_back_from_a_picture(bare: Mesh, planted: Tensor) -> None:
     assert torch.equal(worn.colors[skin], bare.colors[skin])
     eyes = bare.vertices[bare.landmarks[36:48]].mean(0)
     camera = look_at(eyes, 10.0, span=160.0, width=640, height=400)
-    found = iris_color(bare, [render(worn, camera, lighting=EVEN, samples=1)], [camera])
-    assert float((found - planted).norm()) < 0.12
     fronts, wide = [], bare.colors.clone()  # irises of people's size; those of the coarse ball fade from their middle
     for side in ("right", "left"):
         ball = bare.annotations.regions[f"eyeball_{side}"].nonzero()[:, 0]
@@ -57,6 +55,7 @@ def test_irises_come_back_from_a_picture(bare: Mesh, planted: Tensor) -> None:
     picture = render(replace(bare, colors=wide), camera, lighting=EVEN, samples=1)
     ringed = iris_color(bare, [picture], [camera], camera.project(torch.stack(fronts))[None])
     assert float((ringed - planted).norm()) < 0.05
+    assert float((iris_color(bare, [picture], [camera]) - planted).norm()) < 0.05  # midway between the lids
     centres = camera.project(torch.stack(fronts)).expand(3, 2, 2)
     sepia = (picture.mean(0) * torch.tensor([1.0, 0.75, 0.4])[:, None, None]).clamp(max=1)
     three = iris_color([bare] * 3, [picture, sepia, picture], [camera] * 3, centres)

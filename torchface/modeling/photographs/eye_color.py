@@ -8,21 +8,13 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import Camera
-from torchface.geometry.meshes.operators import vertex_normals
 from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.mesh import Mesh
 from torchface.part_materials import EYEBALL, part_material
-from torchface.rendering.camera_visibility import shown_in
-from torchface.rendering.raycast import RayCaster
 
 IRIS_WIDTH = 11.7
 """Of people's irises, millimetres."""
 
-_MIN_DIAMETER = 14.0  # across an eyeball; of smaller ones a photograph shows no iris
-_SHARE = (0.35, 0.60)
-"""Of the eyeball between the lids, the darkest first: lashes and pupil, then the iris, then white and highlights."""
-
-_MIN_PIXELS = 40
 _MIN_RADIUS, _MIN_RING, _RING = 2.5, 6, (0.45, 0.8)  # pixels, pixels, radii
 _DARKEST, _LARGE = 0.07, 0.4  # of the largest iris' radius: in which photographs colours count
 _PURPLE = 0.9  # of the lesser of red and blue: what green an iris has at least
@@ -34,58 +26,28 @@ def iris_color(
 ) -> Tensor | None:
     """The irises' colour (3,), sRGB, or None where no photograph is large enough to show it.
 
-    Where the irises are known, rings about their centres count, without lids, lashes and highlights. Else what is seen
-    of the eyeballs between the lids: the dark share that is neither lash and pupil nor white.
+    Rings about their centres count, without lids, lashes and highlights: each channel's median of photographs that are
+    large enough, so that one in coloured light does not decide.
 
     Args:
-        posed: the head as the photographs show it, or as each of them does, its eyeballs annotated.
-        irises: centres in each photograph, (I,2,2) pixels.
+        posed: the head as the photographs show it, or as each of them does, with the 68 landmarks.
+        irises: centres in each photograph, (I,2,2) pixels; midway between the lids if absent.
     """
-    ringed = None if irises is None else _ring_color(irises, images, cameras, posed)
-    if ringed is not None:
-        return ringed
-    meshes = [posed] * len(images) if isinstance(posed, Mesh) else posed
-    regions = {} if meshes[0].annotations is None else meshes[0].annotations.regions
-    balls = [mask.cpu() for name, mask in regions.items() if part_material(name) is EYEBALL and bool(mask.any())]
-    if not balls:
-        return None
-    clear = torch.zeros(len(meshes[0].vertices), dtype=torch.bool)
-    for name, mask in regions.items():
-        material = part_material(name)
-        clear |= mask.cpu() if material is not None and material.alpha == "BLEND" else torch.zeros_like(clear)
-    seen = []
-    for mesh, image, camera in zip(meshes, images, cameras, strict=True):  # photographs
-        vertices, faces = mesh.vertices.detach().cpu().double(), mesh.faces.cpu()
-        caster = RayCaster(vertices, faces[~clear[faces].all(1)])
-        shown = shown_in(image.cpu(), camera, caster, vertices, vertex_normals(vertices, faces))
-        for ball in balls:
-            pixels = camera.project(vertices[ball])
-            if float((pixels.amax(0) - pixels.amin(0)).amin()) >= _MIN_DIAMETER:
-                seen.append(shown.colors[ball & (shown.cosine > 0.3)].double())
-    colors = torch.cat(seen) if seen else torch.zeros(0, 3, dtype=torch.float64)
-    if len(colors) < _MIN_PIXELS:
-        return None
-    order = colors.mean(1).argsort()
-    first, last = (round(share * len(order)) for share in _SHARE)
-    return colors[order[first : max(last, first + 1)]].median(0).values.clamp(0.03, 0.9).float()
-
-
-def _ring_color(
-    irises: Tensor, images: Sequence[Tensor], cameras: Sequence[Camera], posed: Mesh | Sequence[Mesh]
-) -> Tensor | None:
-    """The colour (3,) of rings about the irises' centres (I,2,2), each channel's median of photographs that are large
-    enough, so that one in coloured light does not decide; None without any."""
     found, radii = list[Tensor](), list[float]()
     meshes = [posed] * len(images) if isinstance(posed, Mesh) else posed
-    for mesh, image, camera, centres in zip(meshes, images, cameras, irises.double(), strict=True):
+    for number, (mesh, image, camera) in enumerate(zip(meshes, images, cameras, strict=True)):
         marks = mesh.vertices[mesh.landmarks][36:48].detach().cpu().double()
         depth = float((marks @ camera.rotation.double()[2] + camera.translation.double()[2]).mean())
         radius = 0.5 * IRIS_WIDTH * float(camera.intrinsics[0, 0]) / depth
         if radius < _MIN_RADIUS:
             continue
-        seen = camera.project(marks)
-        eyes = zip(centres, (seen[:6], seen[6:]), strict=True)
-        rings = [_ring(image, centre, lids, radius) for centre, lids in eyes if bool(torch.isfinite(centre).all())]
+        eyes = camera.project(marks).view(2, 6, 2)
+        centres = eyes.mean(1) if irises is None else irises[number].double()
+        rings = [
+            _ring(image.cpu(), centre, lids, radius)
+            for centre, lids in zip(centres, eyes, strict=True)
+            if bool(torch.isfinite(centre).all())
+        ]
         colors = torch.cat(rings) if rings else torch.zeros(0, 3)
         if len(colors) < _MIN_RING:
             continue

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchface.landmarks.images.face_crop import cut_crop
 from torchface.landmarks.images.networks.part_finder import FaceParts
-from torchface.modeling.photographs.skin_mask import FacePlaces
+from torchface.modeling.photographs.skin_mask import FacePlaces, ramp
 from torchface.rendering.camera_visibility import Shown
 
 # In distances between the eyes' outer corners, about the middle between them: how high hair begins over the face's
@@ -24,13 +24,10 @@ _LONG_BEHIND, _LONG_NAPE = (0.48, 0.66), -1.5
 _EDGE, _FRINGE = 0.08, 0.07
 _ABOVE_BROWS, _SQUARE, _HAIR = 0.06, 0.3, 0.5
 _DEEP, _SHARPLY = 5.0, 2  # pixels of the crop within hair, and the power with which they count
-_WHITE, _UNSURE = 0.1, 0.1  # of its brightness, by which the channels of white hair differ at most; its share
 _LEAST, _SHARE = 20, 0.3
 _EXTREME = 0.2  # share of hair in highlights, and in the deepest shade
 _DYED = 0.2  # of full white, between the channels of dyed hair
 _BEYOND, _MIDDLE = 0.2, 0.35  # share of hair in a picture above the brows, there about the face's middle
-# Of full white; shares: of hair in wide patches (leaves 0.53, hair at least 0.70), of what is green beside them.
-_GREEN, _PATCHY, _LEAFY = 0.008, 0.62, 0.2
 _COLUMNS, _COLUMN, _FEW = 17, 0.05, 6  # across the forehead, half the width of each, vertices
 _MIDDLE_COLUMNS, _LOW_FRINGE = slice(5, 12), 0.2  # in which a fringe hangs so far below the usual hairline
 _STEP, _REACH = 0.03, 0.3  # over which the slope of the line is taken, and how far the line counts
@@ -74,17 +71,17 @@ class HairCap:
         locks = _noise(self._way(place, *_LOCKS)) - 0.5
         thick = beyond / _THIN + _RAGGED * locks + 0.5
         strand = _noise(self._way(place, *_STRANDS))
-        return _ramp(thick, 0.0, 1.0) * _ramp(thick + strand - 0.5, 0.0, 0.8)
+        return ramp(thick, 0.0, 1.0) * ramp(thick + strand - 0.5, 0.0, 0.8)
 
     def _line(self, across: Tensor, behind: Tensor) -> Tensor:
         """How high hair begins at places (Q,) across the face and behind the ears' front, (Q,)."""
         column = (across / _TEMPLE).clamp(-1, 1) * ((_COLUMNS - 1) // 2) + (_COLUMNS - 1) // 2
         left = column.floor().long().clamp(max=_COLUMNS - 2)
         line = torch.lerp(self.line[left], self.line[left + 1], column - left)
-        line = torch.lerp(line, torch.full_like(line, _SIDEBURN), _ramp(behind, *_SIDES))
-        line = torch.lerp(line, torch.full_like(line, _OVER_EARS), _ramp(behind, *_EAR))
+        line = torch.lerp(line, torch.full_like(line, _SIDEBURN), ramp(behind, *_SIDES))
+        line = torch.lerp(line, torch.full_like(line, _OVER_EARS), ramp(behind, *_EAR))
         where, low = (_LONG_BEHIND, _LONG_NAPE) if self.long else (_BEHIND, _NAPE)
-        return torch.lerp(line, torch.full_like(line, low), _ramp(behind, *where))
+        return torch.lerp(line, torch.full_like(line, low), ramp(behind, *where))
 
     def painted(self, colors: Tensor, place: Tensor, share: Tensor) -> Tensor:
         """Colours (Q,3) with the hair over them, in strands that hang down."""
@@ -114,19 +111,18 @@ def _noise(at: Tensor) -> Tensor:
 def hair_cap(
     images: Sequence[Tensor],
     parts: Sequence[FaceParts],
-    heads: Sequence[Tensor],
     marks: Sequence[Tensor],
     shown: Sequence[Shown],
     places: Sequence[FacePlaces],
     hair: Tensor,
 ) -> HairCap | None:
-    """The hair (I,V), see ``ShownParts``, that photographs (3,H,W) with heads (V,2) and landmarks (68,2) show above the
-    brows, on the head that was found or off it; None without.
+    """The hair (I,V), see ``ShownParts``, that photographs (3,H,W) with landmarks (68,2) show above the brows, on the
+    head that was found or off it; None without.
     """
     place, covered = _over_brows(shown, places, hair)
     high = place[:, 1] > _HAIRLINE - _FALL
     on_head = int((covered & high).sum()) >= max(_LEAST, _SHARE * int(high.sum()))
-    color = _hair_color(images, parts, heads, marks, on_head)
+    color = _hair_color(images, parts, marks, on_head)
     if color is None:
         return None
     return HairCap(color, _hairline(place, covered), places[0], hangs_down(parts, torch.stack(list(marks))))
@@ -165,29 +161,23 @@ def _usual_line(across: Tensor) -> Tensor:
 
 
 def _hair_color(
-    images: Sequence[Tensor],
-    parts: Sequence[FaceParts],
-    heads: Sequence[Tensor],
-    marks: Sequence[Tensor],
-    on_head: bool,
+    images: Sequence[Tensor], parts: Sequence[FaceParts], marks: Sequence[Tensor], on_head: bool
 ) -> Tensor | None:
     """The mean colour (3,) of hair above the brows, without highlights and the deepest shade; None without.
 
     Where none is seen on the head that was found, it may stand off it, such as a shock of it.
     """
     colors, weights = [], []
-    for image, shown, head, points in zip(images, parts, heads, marks, strict=True):
+    for image, shown, points in zip(images, parts, marks, strict=True):
         size, transform = shown.shares.shape[-1], shown.transform
         crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), transform, size).float() / 255
         at = points.double() @ transform[:, :2].T + transform[:, 2]
         top = int(at[17:27, 1].amin().clamp(0, size))
-        share = torch.maximum(shown.of("hair"), _white_hair(shown, crop, head))[:top].double()
+        share = shown.of("hair")[:top].double()
         hair, crop = share > _HAIR, crop[:, :top]
         middle = (torch.arange(size) - at[36:48, 0].mean()).abs() / (at[45] - at[36]).norm() < _MIDDLE
         seen = hair[:, middle].double().mean() if hair.numel() else torch.zeros(())
-        if on_head or (
-            float(seen) > _BEYOND and not _leaves(crop[..., middle], hair[:, middle], shown.of("skin")[:top, middle])
-        ):
+        if on_head or float(seen) > _BEYOND:
             # The border of hair is mixed with what stands behind it and with skin.
             inside = (_grown(shown, points, share) * hair).byte().numpy()
             weight = (
@@ -205,23 +195,6 @@ def _hair_color(
     # Hair that is not dyed is never bluish: the light or the camera is.
     cast = bool(color[2] > color[0]) and float(color.amax() - color.amin()) < _DYED
     return color.mean().expand(3) if cast else color
-
-
-def _white_hair(shown: FaceParts, crop: Tensor, head: Tensor) -> Tensor:
-    """How surely pixels of a crop (3,S,S) show white hair off a head at (V,2), (S,S): the network takes it
-    rather for skin, which has a hue and is on the head."""
-    at = head.double() @ shown.transform[:, :2].T + shown.transform[:, 2]
-    outline = cv2.convexHull(at.round().int().numpy())
-    inside = torch.from_numpy(cv2.fillConvexPoly(np.zeros(crop.shape[1:], np.uint8), outline, 1)).bool()
-    grey = crop.amax(0) - crop.amin(0) < _WHITE * crop.mean(0)
-    return shown.of("hair", "skin") * (grey & ~inside & (shown.of("hair") > _UNSURE))
-
-
-def _leaves(crop: Tensor, hair: Tensor, skin: Tensor) -> bool:
-    """Whether what is taken for hair (H,W) are leaves behind a bald head: patches beside green ones."""
-    whole = cv2.morphologyEx(hair.numpy().astype(np.uint8), cv2.MORPH_OPEN, np.ones((5, 5), np.uint8))
-    green = (crop[1] > crop[[0, 2]].amax(0) + _GREEN)[skin < _HAIR]
-    return float(whole.sum()) < _PATCHY * float(hair.sum()) and float(green.double().mean()) > _LEAFY
 
 
 def hangs_down(parts: Sequence[FaceParts], marks: Tensor) -> bool:
@@ -279,8 +252,3 @@ def _line(heights: Tensor, hair: Tensor, usual: Tensor) -> Tensor:
     line = heights[order[best]]
     # The ends of a fringe hang thinner than half, down to the brows.
     return line - _FRINGE if float(line) < float(usual) - 2 * _FRINGE else line
-
-
-def _ramp(value: Tensor, low: float, high: float) -> Tensor:
-    share = ((value - low) / (high - low)).clamp(0, 1)
-    return share * share * (3 - 2 * share)

@@ -144,7 +144,7 @@ def photographed_skin(
             hair = torch.where(others, 0.0, torch.stack([view.parts.hair for view in views]))
             pixels = [view.camera.project(view.surface.vertices) for view in views]
             marks = [one[mesh.landmarks.cpu()] for one in pixels]
-            cap = hair_cap(images, parts, pixels, marks, [view.shown for view in views], places, hair)
+            cap = hair_cap(images, parts, marks, [view.shown for view in views], places, hair)
     own = base is None and bool(others.any()) and not bool(others.all())
     if own:
         confidence = torch.where(others, 0.0, torch.ones(count, len(others)) if confidence is None else confidence)
@@ -155,7 +155,7 @@ def photographed_skin(
     if cap is not None and paint_hair:
         texture = _capped(texture, cap, mesh, others)
     colors = texture.colors
-    iris = iris_color(posed, images, cameras, irises)
+    iris = iris_color(posed, images, cameras, irises) if _has_landmarks(mesh) else None
     if own or iris is not None:
         rest, painted = rest or mesh, torch.tensor(IRIS.color) if iris is None else iris
         colored = with_part_colors(replace(rest, colors=colors), painted)

@@ -72,11 +72,11 @@ class FacePlaces:
         from_brow = torch.cdist(place, at[JAW:27]).amin(1)
         ears, brows = float(at[[0, 16], 2].mean()), float(at[17:27, 1].mean())
         from_eyes = torch.cdist(place, at[36:48]).amin(1)
-        frames = _ramp(from_eyes, *_FRAMES[:2]) * (1 - _ramp(from_eyes, *_FRAMES[2:])) * _ramp(from_brow, *_LID_BROW)
+        frames = ramp(from_eyes, *_FRAMES[:2]) * (1 - ramp(from_eyes, *_FRAMES[2:])) * ramp(from_brow, *_LID_BROW)
         beside = torch.cdist(place, at[[31, 32, 33, 34, 35, *range(36, LANDMARKS)]]).amin(1)
         return FacePlaces(
             length / reach, length - reach, place, features, ears - place[:, 2], at[8], from_brow < _BROW,
-            _upper_lids(place, at) * _ramp(from_brow, *_LID_BROW), frames, _ramp(beside, *_RIM), brows, ears,
+            _upper_lids(place, at) * ramp(from_brow, *_LID_BROW), frames, ramp(beside, *_RIM), brows, ears,
         )  # fmt: skip
 
 
@@ -96,7 +96,7 @@ class ShownParts:
         Without parts all inside the face's outline is the person's. Far below the chin and behind the ears nothing is.
         """
         below = places.beyond * (places.place[:, 1] < 0.5 * places.chin[1])
-        falloff = (1 - _ramp(below, *_NECK)) * (1 - _ramp(places.behind, *_BEHIND))
+        falloff = (1 - ramp(below, *_NECK)) * (1 - ramp(places.behind, *_BEHIND))
         if parts is None:
             inside = (places.out < 1).double() * falloff
             return ShownParts(inside, inside, torch.zeros_like(inside), torch.zeros_like(inside))
@@ -105,10 +105,10 @@ class ShownParts:
         )
         # Thick brows and beards look like hair; where hair hangs over the brows too there is a fringe.
         above = places.place[:, 1] - places.brows
-        fringe = _ramp(
+        fringe = ramp(
             hair[(above > _FRINGE[0]) & (above < _FRINGE[1]) & (places.out < 1)].mean().nan_to_num(1.0), *_HANGS
         )
-        grown = hair * _ramp(_NOSE - places.place[:, 1], 0.0, 0.1) * (places.out < 1)
+        grown = hair * ramp(_NOSE - places.place[:, 1], 0.0, 0.1) * (places.out < 1)
         grown = torch.maximum(grown, hair * places.brow * (1 - fringe))
         # What lies beside hair is in its shadow, and between strands of a fringe is no skin to be painted.
         over = places.place[:, 1] > _NOSE
@@ -128,7 +128,7 @@ def _upper_lids(place: Tensor, at: Tensor) -> Tensor:
     edge = torch.cat(edges)
     distance, nearest = torch.cdist(place, edge).min(1)
     over = distance * (place[:, 1] > edge[nearest, 1])
-    return _ramp(over, *_LID[:2]) * (1 - _ramp(over, *_LID[2:]))
+    return ramp(over, *_LID[:2]) * (1 - ramp(over, *_LID[2:]))
 
 
 def _radius(outline: Tensor, angle: Tensor) -> Tensor:
@@ -143,7 +143,7 @@ def _radius(outline: Tensor, angle: Tensor) -> Tensor:
     return torch.lerp(reach[after - 1], reach[after], share.clamp(0, 1)).clamp(min=1e-6)
 
 
-def _ramp(value: Tensor, low: float, high: float) -> Tensor:
+def ramp(value: Tensor, low: float, high: float) -> Tensor:
     """0 below ``low``, 1 above ``high``, smooth between."""
     share = ((value - low) / (high - low)).clamp(0, 1)
     return share * share * (3 - 2 * share)
