@@ -206,6 +206,21 @@ class Mesh:
             raise ValueRangeError("mesh: no landmark vertices are annotated; set Annotations(landmarks=...)")
         return self.annotations.landmarks
 
+    @property
+    def regions(self) -> dict[str, Tensor]:
+        """Annotated regions by name, (V,) bool each; none where the mesh has no annotations."""
+        return {} if self.annotations is None else self.annotations.regions
+
+    def require_topology(self, other: Mesh, source: str | Path, owner: str | Path, hint: str = "") -> None:
+        """Raises ``TopologyError`` where this mesh, of a source, has not the vertices and triangles of another one."""
+        if len(self.vertices) == len(other.vertices) and torch.equal(self.faces, other.faces.to(self.faces)):
+            return
+        same = "other triangles" if self.faces.shape == other.faces.shape else f"{len(other.faces)} triangles"
+        raise TopologyError(
+            f"{source}: found {len(self.vertices)} vertices and {len(self.faces)} triangles, expected those of "
+            f"{owner}, {len(other.vertices)} vertices and {same}, in their order{hint}"
+        )
+
     def fingerprint(self) -> str:
         """Sixteen hex digits that two meshes share when their triangles are the same."""
         digest = hashlib.sha256(self.faces.cpu().contiguous().numpy().tobytes())

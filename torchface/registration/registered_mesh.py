@@ -58,7 +58,7 @@ def hidden_parts(mesh: Mesh, matched: Tensor) -> Tensor:
     hidden = shown < _SEEN
     hidden[size.argmax()] = False
     result = hidden[label]
-    for name, region in ({} if mesh.annotations is None else mesh.annotations.regions).items():
+    for name, region in mesh.regions.items():
         if part_material(name) is not None:  # a scan that looks into the mouth has its colours
             result |= region.cpu() & ~matched.cpu()
     return result

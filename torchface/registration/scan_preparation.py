@@ -188,7 +188,7 @@ def _check_size(own: Tensor, points: Tensor) -> None:
 
 def one_side_notes(template: Mesh, matched: Tensor) -> list[str]:
     """A warning of parts of the face that a scan shows on one side only; matched (V,) bool is what it shows."""
-    regions = {} if template.annotations is None else template.annotations.regions
+    regions = template.regions
     pairs = {part: [regions.get(f"{part}_{side}") for side in ("left", "right")] for part in _PAIRED}
     if "face" in regions:
         face, across = regions["face"], template.vertices[:, 0]

@@ -28,7 +28,7 @@ def triangle_colors(mesh: Mesh) -> Tensor:
 def clear_triangles(mesh: Mesh) -> Tensor:
     """The triangles (F,) bool, on the CPU, of lashes and of shells over eyes that viewers blend with what is behind."""
     clear = torch.zeros(len(mesh.faces), dtype=torch.bool)
-    for name, mask in _regions(mesh).items():
+    for name, mask in mesh.regions.items():
         material = part_material(name)
         if material is not None and material.alpha == "BLEND":
             clear |= mask[mesh.faces].all(1).cpu()
@@ -47,7 +47,7 @@ def without_clear_shells(mesh: Mesh) -> Mesh:
 def _colors(mesh: Mesh, points: Tensor, inside: Callable[[Tensor], Tensor]) -> Tensor:
     """Colours of points (N,3), of which those of a region, a mask of the vertices, are found so, (N,) bool."""
     colors = torch.tensor(CLAY).repeat(len(points), 1)
-    for name, mask in _regions(mesh).items():
+    for name, mask in mesh.regions.items():
         material, members = part_material(name), inside(mask.cpu())
         if material is None or material.alpha == "BLEND" or not bool(members.any()):
             continue
@@ -66,7 +66,3 @@ def _off_axis(eyeball: Tensor, points: Tensor) -> Tensor:
     middle[2] = high[2] - (high[:2] - low[:2]).amax() / 2  # what is seen is a ball, behind it may be a nerve
     way = points - middle
     return torch.rad2deg(torch.acos((way[:, 2] / way.norm(dim=1)).clamp(-1, 1)))
-
-
-def _regions(mesh: Mesh) -> dict[str, Tensor]:
-    return {} if mesh.annotations is None else mesh.annotations.regions

@@ -57,7 +57,7 @@ class QuickClay:
         painted = paint is not None
         if paint is not None:
             colors[drawn] = _with_iris(colors[drawn], *paint)
-        for name, mask in ({} if mesh.annotations is None else mesh.annotations.regions).items():
+        for name, mask in mesh.regions.items():
             if name in {"upper_lip", "lower_lip"} and not painted:  # a texture shows them
                 colors[mask.cpu()[faces].all(1)] = torch.tensor(_LIPS)
         clay = torch.tensor([CLAY])

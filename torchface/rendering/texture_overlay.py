@@ -37,10 +37,9 @@ def skin_faces(mesh: Mesh) -> Tensor:
     By the names of the annotated regions; a mesh without is skin all over.
     """
     skin = torch.ones(len(mesh.vertices), dtype=torch.bool)
-    if mesh.annotations is not None:
-        for name, mask in mesh.annotations.regions.items():
-            if name.startswith(_NOT_SKIN):
-                skin &= ~mask.cpu()
+    for name, mask in mesh.regions.items():
+        if name.startswith(_NOT_SKIN):
+            skin &= ~mask.cpu()
     return skin[mesh.faces.cpu()].all(1)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from torchface.errors import FileFormatError, NameMismatchError, TopologyError, ValueRangeError
+from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.files.whole_files import check_there, numbered_order
 from torchface.io import MeshSequence, load_animation, load_mesh, load_rig, load_take
 from torchface.io.head_models.array_files import ArrayFile
@@ -57,16 +57,6 @@ class AnimatedMesh:
     missing: str = ""  # which frames of a folder are not there, for people to read; empty where none is known to be
     # Of the vertices, (t,V,3) in [0,1], read as read does, where meshes have them.
     colors: Callable[[int, int], Tensor] | None = None
-
-    def require_topology_of(self, other: "AnimatedMesh", hint: str = "") -> None:
-        """Checks that both have the same vertices and triangles."""
-        own, theirs = self.neutral, other.neutral
-        if len(own.vertices) != len(theirs.vertices) or not torch.equal(own.faces, theirs.faces):
-            same = "other triangles" if own.faces.shape == theirs.faces.shape else f"{len(theirs.faces)} triangles"
-            raise TopologyError(
-                f"{self.path}: found {len(own.vertices)} vertices and {len(own.faces)} triangles, expected those of "
-                f"{other.path}, {len(theirs.vertices)} vertices and {same}{hint}"
-            )
 
 
 def load_animated(
@@ -244,11 +234,7 @@ def meshes_over_time(path: Path, files: list[Path], rig: BlendshapeRig | None, u
     @lru_cache(maxsize=_KEPT)  # vertices and colours of a frame are asked for after one another
     def one(file: Path) -> Mesh:
         mesh = load_mesh(file, unit)
-        if len(mesh.vertices) != len(first.vertices) or not torch.equal(mesh.faces, first.faces):
-            raise TopologyError(
-                f"{file}: found {len(mesh.vertices)} vertices and {len(mesh.faces)} triangles, expected those of "
-                f"{files[0].name}, {len(first.vertices)} and {len(first.faces)}"
-            )
+        mesh.require_topology(first, file, files[0].name)
         return mesh
 
     def read(begin: int, end: int) -> Tensor:
@@ -268,11 +254,7 @@ def _at_rest(path: Path, mesh: Mesh, rig: BlendshapeRig | None) -> Mesh:
     """The rig's neutral where there is a rig; it must have the mesh's topology."""
     if rig is None:
         return mesh
-    if len(rig.vertices) != len(mesh.vertices) or not torch.equal(rig.neutral.faces, mesh.faces):
-        raise TopologyError(
-            f"{path}: found {len(mesh.vertices)} vertices and {len(mesh.faces)} triangles, expected those of the rig, "
-            f"{len(rig.vertices)} and {len(rig.neutral.faces)}"
-        )
+    mesh.require_topology(rig.neutral, path, "the rig")
     return rig.neutral
 
 

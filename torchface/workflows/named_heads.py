@@ -71,7 +71,6 @@ def matching(
         source, rig = str(template), load_rig(template)
     elif rig is None:
         source, rig = "the embedded performer", performer()
-    parts = {} if rig.neutral.annotations is None else rig.neutral.annotations.regions
     if part is not None:
         keep = region(rig.neutral, part)
         if _same_topology(model, rig):
@@ -80,7 +79,7 @@ def matching(
     if _same_topology(model, rig):
         return model, _with_one_image(rig)
     count = len(model.shape.mean)
-    fitting = [name for name, mask in parts.items() if part is None and int(mask.sum()) == count]
+    fitting = [name for name, mask in rig.neutral.regions.items() if part is None and int(mask.sum()) == count]
     hint = "; name a rig with --template whose topology is the model's" if template is None else ""
     raise TopologyError(
         f"{source}: found {len(rig.vertices)} vertices and {len(rig.neutral.faces)} triangles, expected the model's "
@@ -94,8 +93,8 @@ def _with_one_image(rig: BlendshapeRig) -> BlendshapeRig:
     if mesh.texture is not None or mesh.uvs is None or mesh.uv_faces is None:
         return rig
     kind = torch.zeros(len(mesh.faces), dtype=torch.int64)
-    regions = {} if mesh.annotations is None else mesh.annotations.regions
-    for number, (name, mask) in enumerate(regions.items(), 2):  # each eyeball has its own, and clear shells have one
+    # Each eyeball has its own, and clear shells have one.
+    for number, (name, mask) in enumerate(mesh.regions.items(), 2):
         material = part_material(name)
         if material is not None:
             kind[mask.cpu()[mesh.faces.cpu()].all(1)] = 1 if material.alpha == "BLEND" else number

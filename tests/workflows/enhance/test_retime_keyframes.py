@@ -54,7 +54,7 @@ def test_keyframes_that_do_not_fit_are_named(actor, tmp_path: Path) -> None:
         (Keyframe(weights, None, rig), ValueRangeError, "expected the first before"),
         (Keyframe(weights, 99, rig), ValueRangeError, "found no frame 99, expected 0 to 11"),
         (Keyframe(rig), ValueRangeError, "keyframes: found two that are equal"),
-        (Keyframe(cut), TopologyError, r"cut\.obj: found .* expected the model's"),
+        (Keyframe(cut), TopologyError, r"cut\.obj: found .* expected those of the model"),
         (Keyframe(shuffled), TopologyError, "order"),
     ):
         first = Keyframe(weights, 0, rig) if last.path == rig else fine

@@ -145,7 +145,7 @@ def load_identity_modes(
 
 def region(mesh: Mesh, name: str) -> Tensor:
     """The mask (V,) of a region that the mesh is annotated with."""
-    regions = {} if mesh.annotations is None else mesh.annotations.regions
+    regions = mesh.regions
     if name not in regions:
         raise NameMismatchError(f"part: found {name!r}, expected one of {', '.join(regions) or 'none at all'}")
     return regions[name]

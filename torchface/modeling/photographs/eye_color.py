@@ -78,11 +78,11 @@ def _ring(image: Tensor, centre: Tensor, lids: Tensor, radius: float) -> Tensor:
 
 def with_iris(mesh: Mesh, iris: Tensor) -> Mesh:
     """A mesh at rest whose texture has painted eyeballs, with their irises in another colour (3,), fibres and all."""
-    if mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None or mesh.annotations is None:
+    if mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None:
         return mesh
     height, width = mesh.texture.shape[1:]
     texture, vertices = mesh.texture.cpu().flatten(1).clone(), mesh.vertices.detach().cpu().double()
-    for name, mask in mesh.annotations.regions.items():
+    for name, mask in mesh.regions.items():
         if part_material(name) is not EYEBALL or not bool(mask.any()):
             continue
         inside = mask.cpu()[mesh.faces.cpu()].all(1)

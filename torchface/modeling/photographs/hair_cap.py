@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.landmarks.images.face_crop import cut_crop
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.modeling.photographs.skin_mask import FacePlaces, ramp
 from torchface.rendering.camera_visibility import Shown
@@ -169,9 +168,8 @@ def _hair_color(
     """
     colors, weights = [], []
     for image, shown, points in zip(images, parts, marks, strict=True):
-        size, transform = shown.shares.shape[-1], shown.transform
-        crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), transform, size).float() / 255
-        at = points.double() @ transform[:, :2].T + transform[:, 2]
+        crop, size = shown.crop(image), shown.shares.shape[-1]
+        at = shown.in_crop(points)
         top = int(at[17:27, 1].amin().clamp(0, size))
         share = shown.of("hair")[:top].double()
         hair, crop = share > _HAIR, crop[:, :top]
@@ -230,7 +228,7 @@ def _grown(shown: FaceParts, points: Tensor, share: Tensor) -> Tensor:
     """
     hair = cv2.erode((share > _HAIR).numpy().astype(np.uint8), np.ones((3, 3), np.uint8))
     _, label = cv2.connectedComponents(hair, connectivity=4)
-    brows = points[17:27] @ shown.transform[:, :2].T + shown.transform[:, 2]
+    brows = shown.in_crop(points[17:27])
     high = int(brows[:, 1].nan_to_num(0.0).amin().clamp(0, len(label)))
     left, right = brows[:, 0].nan_to_num(0.0).aminmax()
     over = label[:high, max(0, int(left)) : max(1, int(right))]

@@ -346,8 +346,7 @@ def smooth_differences(vertices: Tensor, landmarks: Tensor, deviation: float) ->
 
 def with_whole_eyeballs(fields: Tensor, mesh: Mesh) -> Tensor:
     """Displacements (M,V,3) of a mesh that move each of its annotated eyeballs without bending it."""
-    regions = {} if mesh.annotations is None else mesh.annotations.regions
-    for name, mask in regions.items():
+    for name, mask in mesh.regions.items():
         if part_material(name) is EYEBALL and bool(mask.any()):
             ball = mask.to(fields.device)
             fields[:, ball] = fields[:, ball].mean(1, keepdim=True)

@@ -332,7 +332,7 @@ def _with_parts(texture: PhotoTexture, colors: Tensor, mesh: Mesh, parts: Tensor
     texels, faces = texture.texels, mesh.faces.cpu()
     corners = faces[texels.triangles]
     painted = texels.interpolate(colors.double(), faces)
-    for name, mask in ({} if mesh.annotations is None else mesh.annotations.regions).items():
+    for name, mask in mesh.regions.items():
         if part_material(name) is EYEBALL and bool(mask.any()):
             ball = mesh.vertices[mask].detach().cpu().double()
             at = texels.interpolate(mesh.vertices.detach().cpu().double() - (ball.amin(0) + ball.amax(0)) / 2, faces)
@@ -366,7 +366,7 @@ def _has_landmarks(mesh: Mesh) -> bool:
 def part_vertices(mesh: Mesh) -> Tensor:
     """The vertices of parts that are no skin, by the names of their regions, (V,) bool."""
     result = torch.zeros(len(mesh.vertices), dtype=torch.bool)
-    for name, mask in ({} if mesh.annotations is None else mesh.annotations.regions).items():
+    for name, mask in mesh.regions.items():
         if part_material(name) is not None:
             result |= mask.cpu()
     return result
@@ -375,10 +375,10 @@ def part_vertices(mesh: Mesh) -> Tensor:
 def with_part_colors(mesh: Mesh, iris: Tensor | None) -> Mesh:
     """A head with colours whose parts have those of their materials, and whose eyeballs an iris, sRGB (3,), in
     front."""
-    if mesh.colors is None or mesh.annotations is None:
+    if mesh.colors is None:
         return mesh
     colors = mesh.colors.clone()
-    for name, mask in mesh.annotations.regions.items():
+    for name, mask in mesh.regions.items():
         material = part_material(name)
         if material is None or not bool(mask.any()):
             continue

@@ -8,7 +8,6 @@ from torch import Tensor
 from torchface.color_space import to_linear, to_srgb
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.meshes.vertex_graph import VertexGraph
-from torchface.landmarks.images.face_crop import cut_crop
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.rendering.camera_visibility import Shown
 from torchface.rendering.environment_light import EnvironmentLight, harmonics
@@ -55,7 +54,7 @@ def needed_gain(image: Tensor, parts: FaceParts) -> float:
     whites of the eyes brighter than in good light: beside a dark complexion they are bright in a dim picture too.
     """
     image = image[:3]
-    crop = to_linear(cut_crop((255 * image.clamp(0, 1)).byte(), parts.transform, parts.shares.shape[-1]) / 255).double()
+    crop = to_linear(parts.crop(image)).double()
     eyes, skin = (crop[:, parts.of(name) > _SURE].mean(0) for name in ("eyes", "skin"))
     whole, near = (one.double().amax(0).flatten() for one in (to_linear(image), crop))
     brightest = [float(one.kthvalue(1 + int(_BRIGHTEST * (len(one) - 1))).values) for one in (whole, near)]
@@ -78,7 +77,7 @@ def unveiled(image: Tensor, parts: FaceParts) -> Tensor:
     As much is taken away as makes skin as red as that of people, but no more than is in the darkest of the head; skin
     stays as bright as it was. Grey photographs and those in blue light, whose skin would get bluer, stay as they are.
     """
-    crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), parts.transform, parts.shares.shape[-1]).float() / 255
+    crop = parts.crop(image)
     is_skin, head = parts.of("skin") > _SURE, parts.of(*_HEAD) > _SURE
     if int(is_skin.sum()) < _LEAST:
         return image

@@ -108,7 +108,7 @@ def with_placed_parts(rig: BlendshapeRig, registration: Registration) -> Registr
 def with_mouth_behind_skin(head: Mesh) -> Mesh:
     """An upright head whose ``mouth_interior``, where it has come through lip or chin, lies behind the skin again;
     its rim stays."""
-    regions = {} if head.annotations is None else head.annotations.regions
+    regions = head.regions
     if "mouth_interior" not in regions:
         return head
     bag, faces = regions["mouth_interior"].cpu(), head.faces.cpu()

@@ -166,8 +166,7 @@ def shape_depths(rig: BlendshapeRig, parts: InnerParts) -> Tensor:
 
 def _hair(mesh: Mesh) -> Tensor:
     mask = torch.zeros(len(mesh.vertices), dtype=torch.bool)
-    regions = {} if mesh.annotations is None else mesh.annotations.regions
-    for name, region in regions.items():
+    for name, region in mesh.regions.items():
         if any(word in name.lower() for word in _HAIR):
             mask |= region.cpu()
     return mask

@@ -31,16 +31,15 @@ def framing(mesh: Mesh, aspect: float = 0.8) -> tuple[Tensor, float]:
     if mesh.annotations is not None and mesh.annotations.landmarks is not None:
         # Landmarks end at the brows: leave margin for the forehead, and rotate about a point inside the head.
         points, margin, offset = mesh.vertices[mesh.annotations.landmarks], 1.9, (0.0, 0.12, -0.35)
-    elif mesh.annotations is not None and "face" in mesh.annotations.regions:
-        points, margin = mesh.vertices[mesh.annotations.regions["face"]], 1.2
+    elif "face" in mesh.regions:
+        points, margin = mesh.vertices[mesh.regions["face"]], 1.2
     low, high = points.amin(0), points.amax(0)
     centre = (low + high) / 2 + torch.tensor(offset).to(low) * float(high[1] - low[1])
     across = high[0] - low[0]
     if len(points) == len(mesh.vertices):  # seen from any side
         across = 2 * (points - centre)[:, [0, 2]].norm(dim=1).max()
     span = margin * float(torch.maximum(high[1] - low[1], across / aspect))
-    regions = {} if mesh.annotations is None else mesh.annotations.regions
-    hair = [mask for name, mask in regions.items() if name.startswith("hair") and bool(mask.any())]
+    hair = [mask for name, mask in mesh.regions.items() if name.startswith("hair") and bool(mask.any())]
     if hair and len(points) < len(mesh.vertices):
         above = float(mesh.vertices[torch.stack(hair).any(0), 1].max() - centre[1]) + _OVER_HAIR * span - span / 2
         if above > 0:

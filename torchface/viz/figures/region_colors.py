@@ -18,7 +18,7 @@ def as_seen(mesh: Mesh) -> Mesh:
     have no texels of their own in it: what colours a scan or a photograph gave them are those of the skin before them.
     Clear shells and lashes among them, which hide the eyes, are left out.
     """
-    if not (mesh.annotations and mesh.annotations.regions) or (mesh.texture is None and mesh.colors is not None):
+    if not mesh.regions or (mesh.texture is None and mesh.colors is not None):
         return mesh
     if mesh.texture is None or mesh.uvs is None or mesh.uv_faces is None:
         shown = without_clear_shells(mesh)

@@ -250,6 +250,4 @@ def _layout(rig: BlendshapeRig) -> MakeupLayout | None:
 
 def face_mask(mesh: Mesh) -> Tensor:
     """The annotated region ``face`` (V,), or every vertex where there is none."""
-    if mesh.annotations is not None and "face" in mesh.annotations.regions:
-        return mesh.annotations.regions["face"]
-    return torch.ones(len(mesh.vertices), dtype=torch.bool)
+    return mesh.regions.get("face", torch.ones(len(mesh.vertices), dtype=torch.bool))

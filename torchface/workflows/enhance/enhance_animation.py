@@ -265,11 +265,7 @@ def _texels(path: Path, model: EnhancementModel, name: str, settings: EnhanceSet
     mesh = load_mesh(path)
     if mesh.uvs is None or mesh.uv_faces is None:
         raise TopologyError(f"{path}: found a mesh without texture coordinates, expected some to write colours in")
-    if not torch.equal(mesh.faces, model.faces):
-        raise TopologyError(
-            f"{path}: found {len(mesh.vertices)} vertices and {len(mesh.faces)} triangles, expected the model's, "
-            f"{len(model.neutral)} and {len(model.faces)} in their order"
-        )
+    mesh.require_topology(Mesh(model.neutral, model.faces), path, "the model")
     return rasterise_uvs(mesh.uvs, mesh.uv_faces, settings.texture_size, settings.texture_size)
 
 

@@ -188,8 +188,7 @@ def load_pairs(path: Path, head: Mesh, model: Mesh) -> tuple[Tensor, Tensor]:
 
 def _face(head: Mesh) -> Tensor:
     """The head's annotated face, (V,) bool, or all of it: hair and teeth would be bent onto the model's skin."""
-    regions = {} if head.annotations is None else head.annotations.regions
-    return regions.get("face", torch.ones(len(head.vertices), dtype=torch.bool))
+    return head.regions.get("face", torch.ones(len(head.vertices), dtype=torch.bool))
 
 
 def _landmarks(mesh: Mesh) -> Tensor | None:

@@ -68,13 +68,8 @@ class Keyframe:
     def vertices(self, model: EnhancementModel) -> Tensor:
         """(V,3) in the model's topology."""
         animated = load_animated(self.path, self.rig)
-        found, expected = animated.neutral.faces, model.faces
-        if len(animated.neutral.vertices) != len(model.neutral) or not torch.equal(found, expected.to(found)):
-            raise TopologyError(
-                f"{self.path}: found {len(animated.neutral.vertices)} vertices and {len(found)} triangles, expected "
-                f"the model's, {len(model.neutral)} and {len(expected)} in their order; `torchface enhance` brings "
-                "animations of other topologies to it"
-            )
+        hint = "; `torchface enhance` brings animations of other topologies to it"
+        animated.neutral.require_topology(Mesh(model.neutral, model.faces), self.path, "the model", hint)
         if self.frame is None and animated.count != 1:
             raise ValueRangeError(
                 f"{self.path}: found {animated.count} frames, expected which of them is the keyframe: {self.path}@0 to "

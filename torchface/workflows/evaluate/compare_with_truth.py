@@ -60,7 +60,8 @@ def evaluate(
     progress("reading result and truth")
     animated = load_animated(result, settings.rig, settings.part)
     true = load_animated(truth, settings.truth_rig or settings.rig, settings.part)
-    true.require_topology_of(animated, "; other rigs need --truth-rig, raw scans torchface register first")
+    hint = "; other rigs need --truth-rig, raw scans torchface register first"
+    true.neutral.require_topology(animated.neutral, true.path, animated.path, hint)
     progress("comparing")
     evaluation = compare(animated, true, settings)
     progress("writing")

@@ -6,7 +6,6 @@ import torch
 from torch import Tensor
 
 from torchface.color_space import to_linear
-from torchface.landmarks.images.face_crop import cut_crop
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.modeling.photographs.image_texture import GREY
 
@@ -28,7 +27,7 @@ def part_colors(image: Tensor, parts: FaceParts) -> Tensor:
 
     The brightness of a photograph's light and its hue change none of them.
     """
-    crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), parts.transform, parts.shares.shape[-1]).double() / 255
+    crop = parts.crop(image).double()
     linear, result = to_linear(crop).clamp(min=_DARKEST).log(), torch.full((4,), torch.nan, dtype=torch.float64)
     skin = parts.of("skin") > _SKIN
     if int(skin.sum()) < _FEWEST:

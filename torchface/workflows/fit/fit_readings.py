@@ -74,7 +74,7 @@ def with_readings(settings: FitSettings, readings: FaceReading, places: Tensor, 
 def _with_irises(surface: SurfacePoints, readings: FaceReading, rig: BlendshapeRig) -> SurfacePoints:
     """Points of a surface, then the middles of seen irises where the rig has eyeballs: they show the gaze."""
     neutral = rig.neutral
-    regions = {} if neutral.annotations is None else neutral.annotations.regions
+    regions = neutral.regions
     balls = [regions[name].cpu() for name in ("eyeball_right", "eyeball_left") if name in regions]
     if len(balls) < 2 or not all(bool(ball.any()) for ball in balls):
         return surface

@@ -8,7 +8,6 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.meshes.normal_maps import SurfaceMaps
-from torchface.landmarks.images.face_crop import cut_crop
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.mesh import Mesh
 from torchface.modeling import ImageFit
@@ -77,8 +76,7 @@ def dressed_rig(
 
 def iris_size(mesh: Mesh) -> float:
     """How much wider than painted on the performer's eyeballs irises of people's width are on those of a head."""
-    assert mesh.annotations is not None
-    ball = mesh.vertices[mesh.annotations.regions["eyeball_left"]]
+    ball = mesh.vertices[mesh.regions["eyeball_left"]]
     radius = 0.5 * float((ball.amax(0) - ball.amin(0)).mean())
     return math.asin(min(1.0, 0.5 * IRIS_WIDTH / radius)) / IRIS_EDGE
 
@@ -106,11 +104,8 @@ def _beside(light: Tensor, usual: tuple[float, float]) -> float:
 
 def _pixels(images: Sequence[Tensor], parts: Sequence[FaceParts], name: str, share: float) -> Tensor:
     """The colours (3,P) that crops of photographs have where they show a part by more than a share."""
-    seen = []
-    for image, shown in zip(images, parts, strict=True):
-        crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), shown.transform, shown.shares.shape[-1])
-        seen.append(crop[:, shown.of(name) > share].float() / 255)
-    return torch.cat(seen, 1)
+    pairs = zip(images, parts, strict=True)
+    return torch.cat([shown.crop(image)[:, shown.of(name) > share] for image, shown in pairs], 1)
 
 
 def _cloth(images: Sequence[Tensor], parts: Sequence[FaceParts]) -> Tensor | None:

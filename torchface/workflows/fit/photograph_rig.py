@@ -153,11 +153,11 @@ class FittedHead:
                 "skin that no photograph shows: the head model's colours, which differ from the skin that photographs "
                 f"show by {off / 3**0.5:.0%} of full brightness"
             )
-        regions = {} if self.rig.neutral.annotations is None else self.rig.neutral.annotations.regions
         seen = "brightness in the photographs, which show no colours" if self.grey else "colour in the photographs"
         if fit.hair is not None:
             cut = "haircut with a fringe" if fit.fringe else "haircut"
-            what = f"the template's {cut}, not the person's" if "hair" in regions else "painted on the head as a cap"
+            worn = "hair" in self.rig.neutral.regions
+            what = f"the template's {cut}, not the person's" if worn else "painted on the head as a cap"
             lines.append(f"hair: {_code(fit.hair)}, its {seen}; {what}")
         elif fit.mesh.texture is not None:
             lines.append("hair: none seen over the brows; the network that looks for it misses grey hair at times")

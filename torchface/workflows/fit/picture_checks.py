@@ -12,7 +12,6 @@ from torch.nn.functional import avg_pool2d
 
 from torchface.color_space import to_linear
 from torchface.landmarks import NoFaceError
-from torchface.landmarks.images.face_crop import cut_crop
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.modeling import ImageFit
 from torchface.modeling.photographs.image_texture import GREY
@@ -222,7 +221,7 @@ def grey_lines(photograph: Path, image: Tensor, parts: FaceParts, landmarks: Ten
 def _skin(image: Tensor, parts: FaceParts, marks: Tensor) -> Tensor:
     """The colours of a face's skin, (3,P)."""
     face = _inside(parts, marks)
-    crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), parts.transform, len(face)).double() / 255
+    crop = parts.crop(image).double()
     return crop[:, face & (parts.of("skin") > _SURE)]
 
 
@@ -281,7 +280,7 @@ def _hue_lines(skin: Tensor) -> list[str]:
 
 def _filter_lines(image: Tensor, parts: FaceParts) -> list[str]:
     """What colours of eyes' whites and of hair say of a filter, for people to read."""
-    crop = cut_crop((255 * image[:3].clamp(0, 1)).byte(), parts.transform, parts.shares.shape[-1]).double() / 255
+    crop = parts.crop(image).double()
     eyes, hair = (crop[:, share] for share in (parts.of("eyes") > _PRESENT, parts.of("hair", "brows") > _HAIR))
     lines = []
     if eyes.shape[1] >= _FEW_WHITES:
@@ -327,8 +326,8 @@ def _flat_share(image: Tensor, marks: Tensor) -> float:
 
 def _inside(parts: FaceParts, landmarks: Tensor) -> Tensor:
     """The pixels of the parts' crop within a face with landmarks (68,2), NaN for missing; (S,S) bool."""
-    known = landmarks[landmarks.isfinite().all(-1)].double()
-    return _outlined(known @ parts.transform[:, :2].T + parts.transform[:, 2], parts.shares.shape[1:])
+    known = landmarks[landmarks.isfinite().all(-1)]
+    return _outlined(parts.in_crop(known), parts.shares.shape[1:])
 
 
 def _outlined(points: Tensor, shape: Sequence[int]) -> Tensor:

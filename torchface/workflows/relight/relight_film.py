@@ -254,7 +254,7 @@ def _reaching(light: PointLight, middle: Tensor) -> PointLight:
 
 def _near_face(mesh: Mesh, beyond: float = _BEYOND) -> Tensor:
     """1 on the face, eyes and mouth, less with the distance from it, (V,); 1 everywhere on a head without regions."""
-    regions = {} if mesh.annotations is None else mesh.annotations.regions
+    regions = mesh.regions
     if "face" not in regions:
         return torch.ones(len(mesh.vertices))
     face = regions["face"].cpu() | _inner(mesh)
@@ -267,7 +267,7 @@ def _inner(mesh: Mesh) -> Tensor:
     """Eyes, nose and mouth, (V,) bool."""
     inner = torch.zeros(len(mesh.vertices), dtype=torch.bool)
     inner[mesh.faces[~skin_faces(mesh)].flatten()] = True
-    for name, mask in ({} if mesh.annotations is None else mesh.annotations.regions).items():
+    for name, mask in mesh.regions.items():
         if name.startswith(_INNER):
             inner |= mask.cpu()
     return inner

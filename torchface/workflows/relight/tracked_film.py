@@ -95,8 +95,7 @@ def read_tracked_film(film: Path, track: Path) -> TrackedFilm:
 def bare(rig: BlendshapeRig) -> BlendshapeRig:
     """A rig without hair and clothes, which the film has its own of, and without lashes and shells that are clear,
     which would be painted over the eyes."""
-    regions = {} if rig.neutral.annotations is None else rig.neutral.annotations.regions
-    left_out = [mask for name, mask in regions.items() if name.startswith(_GROWN) or _is_clear(name)]
+    left_out = [mask for name, mask in rig.neutral.regions.items() if name.startswith(_GROWN) or _is_clear(name)]
     return rig.part(~torch.stack(left_out).any(0)) if left_out else rig
 
 

@@ -218,8 +218,7 @@ def _landmarks(reference: Mesh, points: ReferencePoints, placed: Tensor, on_skin
 
 def with_edges(landmarks: Landmarks, reference: Mesh, head: SkinOfHead, placed: Tensor) -> Landmarks:
     """The pairs with the edges of lids and lips in place of the finder's points there, where these can be seen."""
-    assert reference.annotations is not None
-    regions = reference.annotations.regions
+    regions = reference.regions
     eyeballs = regions["eyeball_left"] | regions["eyeball_right"]
     rest = reference.vertices.double()
     template = SkinOfHead(rest, reference.faces, eyeballs, eyeballs.long())

@@ -244,7 +244,7 @@ def _landmarks_added(
 def _registered(template: BlendshapeRig, face: CharacterFace, path: Path, progress: Progress) -> Registration:
     """The template on the head; refused where its face does not come to lie on it."""
     registration = register(template.neutral, face.skin, face.landmarks, texture_size=0, progress=progress)
-    region = template.neutral.annotations.regions["face"]  # type: ignore[union-attr]
+    region = template.neutral.regions["face"]
     met = float(registration.matched[region].double().mean())
     far = float(registration.distance[region].median())
     if not (met >= _LEAST_MET and far <= _FAR):

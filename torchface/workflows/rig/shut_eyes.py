@@ -72,7 +72,6 @@ def with_eye_note(
 
 def eyes_shut_at_rest(face: CharacterFace, reference: Mesh) -> tuple[bool, bool]:
     """Whether a character's right and left eye are modelled shut: no opening, and an eyeball under the skin."""
-    assert reference.annotations is not None
     vertices, faces = face.head.vertices.double(), face.head.faces
     joined = joined_vertices(vertices, faces)
     skin_part = int(joined.part[joined.faces[:, 0]].bincount().argmax())
@@ -81,7 +80,7 @@ def eyes_shut_at_rest(face: CharacterFace, reference: Mesh) -> tuple[bool, bool]
     caster, shut = RayCaster(head.vertices, head.skin), []
     forward = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
     for opening, side in zip(eyes_seen(head, placed), ("right", "left"), strict=True):
-        ball = reference.vertices[reference.annotations.regions[f"eyeball_{side}"]].double()
+        ball = reference.vertices[reference.regions[f"eyeball_{side}"]].double()
         centre = (ball.amax(0) + ball.amin(0)) / 2
         near = head.loose & ((head.vertices - centre).norm(dim=-1) < _BALL * (ball - centre).norm(dim=-1).median())
         hidden = [0.0]

@@ -136,12 +136,11 @@ def _color_source(mesh: Mesh, textured: bool) -> ColorSource:
 
 def _groups(mesh: Mesh) -> list[tuple[PartMaterial, str | None, Tensor]]:
     """Material, eyeball's region and triangles of each part, skin first; none is empty."""
-    regions = {} if mesh.annotations is None else mesh.annotations.regions
     free = torch.ones(len(mesh.faces), dtype=torch.bool)
     parts: list[tuple[PartMaterial, str | None, Tensor]] = []
     for material in PARTS:  # a triangle takes the first that it may be
         together = torch.zeros_like(free)
-        for name, mask in regions.items():
+        for name, mask in mesh.regions.items():
             if part_material(name) is not material:
                 continue
             inside = mask.cpu()[mesh.faces].all(1) & free

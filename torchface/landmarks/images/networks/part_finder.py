@@ -24,6 +24,14 @@ class FaceParts:
     shares: Tensor  # of each of PARTS in the crop's pixels, (10,S,S)
     transform: Tensor  # from the picture's pixels to the crop's, (2,3) float64
 
+    def crop(self, image: Tensor) -> Tensor:
+        """The crop (3,S,S) of the picture (3,H,W) in [0,1]."""
+        return cut_crop((255 * image[:3].clamp(0, 1)).byte(), self.transform, self.shares.shape[-1]).float() / 255
+
+    def in_crop(self, pixels: Tensor) -> Tensor:
+        """Pixels (...,2) of the picture as pixels of the crop, float64."""
+        return pixels.double() @ self.transform[:, :2].T + self.transform[:, 2]
+
     def of(self, *names: str) -> Tensor:
         """The share of some of :data:`PARTS` together in the crop's pixels, (S,S)."""
         return self.shares[[_ROW[name] for name in names]].sum(0)
@@ -38,7 +46,7 @@ class FaceParts:
         return self._shares(pixels, *names)[0]
 
     def _shares(self, pixels: Tensor, *names: str) -> tuple[Tensor, Tensor]:
-        place = pixels.double() @ self.transform[:, :2].T + self.transform[:, 2]
+        place = self.in_crop(pixels)
         size = self.shares.shape[-1]
         grid = ((2 * place + 1) / size - 1).to(self.shares)
         values = grid_sample(

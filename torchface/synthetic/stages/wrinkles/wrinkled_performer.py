@@ -230,8 +230,7 @@ def performer_face(identity: Tensor | None = None) -> BlendshapeRig:
 
 def captured_skin(head: BlendshapeRig) -> Tensor:
     """Which vertices of a performer are of that part, (V,) bool."""
-    assert head.neutral.annotations is not None
-    places, regions = head.neutral.vertices, head.neutral.annotations.regions
+    places, regions = head.neutral.vertices, head.neutral.regions
     hidden = torch.stack([regions[name] for name in _NOT_SKIN]).any(0)
     front = places[:, 2] > _BACK + 0.6 * (places[:, 1] - _CROWN).clamp(min=0)
     return ~hidden & front & (places[:, 1] > _NECK)
