@@ -12,9 +12,10 @@ from planted.glb_files import unpacked
 from torchface import BlendshapeRig, Take, Track, load_take, save_rig, save_take
 from torchface.cli import main
 from torchface.errors import NameMismatchError
-from torchface.io import load_animation, load_image, save_animation
+from torchface.io import load_animation, load_image
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.synthetic import performer
+from torchface.workflows.convert_file import convert_file
 from torchface.workflows.retarget_weights import retarget_weights
 from torchface.workflows.weight_files import WeightFiles
 
@@ -59,20 +60,6 @@ def test_most_shapes_without_a_name_on_the_target_are_counted(tmp_path: Path) ->
     done = retarget_weights(tmp_path / "take.csv", tmp_path / "rig.glb", WeightFiles(tmp_path / "out.csv"))
     said = f"only 1 of the 3 shapes that move in {tmp_path / 'take.csv'} drive a shape of {tmp_path / 'rig.glb'}: "
     assert any(warning.startswith(said) for warning in done.warnings)
-
-
-def test_the_rotations_that_are_not_read_from_an_animated_rig_are_said(tmp_path: Path) -> None:
-    rig = performer(texture=False).select(["jawOpen"])
-    save_rig(rig, tmp_path / "rig.glb")
-    take = Take(60.0, weights=Track(("jawOpen",), torch.full((2, 1, 1), 0.5)))
-    save_animation(rig, take, tmp_path / "take.glb")
-    save_take(take, tmp_path / "take.csv")
-    notes = [
-        retarget_weights(tmp_path / name, tmp_path / "rig.glb", WeightFiles(tmp_path / "out.csv")).notes
-        for name in ("take.glb", "take.csv")
-    ]
-    glb = tmp_path / "take.glb"
-    assert notes == [(f"{glb}: the weights of its shapes are read, not how its head and eyes turn",), ()]
 
 
 def test_action_units_of_openface_move_a_rig_and_those_without_a_shape_are_named(
@@ -180,6 +167,14 @@ def test_the_animated_character_keeps_all_that_it_has(tmp_path: Path) -> None:
     with pytest.warns(UserWarning, match="left out: the character's other animations: .*talk"):
         played = load_animation(tmp_path / "out.glb")
     torch.testing.assert_close(played.weights.values, weights, atol=1e-3, rtol=0)
+    turns = f"{tmp_path / 'out.glb'}: the weights of its shapes are read, not how its head and eyes turn"
+    with pytest.warns(UserWarning, match="left out"):
+        assert turns in convert_file(tmp_path / "out.glb", tmp_path / "plain.glb").notes
+    with pytest.warns(UserWarning, match="left out"):
+        assert retarget_weights(tmp_path / "out.glb", tmp_path / "hero.vrm", WeightFiles(tmp_path / "b.csv")).notes == (
+            turns,
+        )
+    assert retarget_weights(tmp_path / "plain.glb", tmp_path / "hero.vrm", WeightFiles(tmp_path / "b.csv")).notes == ()
 
 
 def test_what_an_unpacked_character_loses_is_said(tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from torchface.rig import BlendshapeRig
 from torchface.take import Take
 from torchface.workflows.posed_mesh import load_neutral, posed_mesh, several_heads
 from torchface.workflows.rig_names import Naming, naming_lines, renamed, renamed_detail
-from torchface.workflows.weight_files import checked_reduction
+from torchface.workflows.weight_files import checked_reduction, unread_turns
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,6 +98,7 @@ def convert_file(
     detail, notes = (None, []) if part is not None else maps_for(source, out)
     if isinstance(detail, DetailMaps):
         detail = renamed_detail(detail, source_rig.rig, names)
+    notes += () if source_rig.take is None else unread_turns(source)
     notes += write_source(rig, source_rig.take, detail, out, reduce)
     if part is None and (heads := several_heads(source_rig.rig)):
         notes.append(f"heads: {heads}")

@@ -19,7 +19,6 @@ from torchface.capture.retargeting import ShapeMap, load_shape_rules, retarget_t
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.files.whole_files import make_folder
 from torchface.io import load_rig
-from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.progress import Progress, silent
 from torchface.rendering.compositing import save_rendered_image
 from torchface.rig import BlendshapeRig
@@ -31,6 +30,7 @@ from torchface.workflows.weight_files import (
     WeightFiles,
     check_live_link,
     load_weight_take,
+    unread_turns,
     weight_faults,
     without_shape,
     write_weights,
@@ -80,9 +80,7 @@ def retarget_weights(
         # By the rig's own spelling, which is what a table names.
         played = replace(played, weights=Track(rig.names, rig.weights_from(played.weights)[..., None]))
     assert played.weights is not None
-    said: tuple[str, ...] = ()
-    if weights.suffix.lower() in SCENE_ENDINGS:
-        said = (f"{weights}: the weights of its shapes are read, not how its head and eyes turn",)
+    said = unread_turns(weights)
     rules = {} if table is None else load_shape_rules(table)
     if poses is not None:
         learned, told = _learned(poses, played.weights.names, target, files.out)

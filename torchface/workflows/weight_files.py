@@ -11,9 +11,10 @@ from torchface.capture.own_rig.eye_geometry import Eyeballs
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
 from torchface.escaped_text import listed
 from torchface.files.whole_files import all_or_none, check_ending, check_writable, make_folder, write_file
+from torchface.io.gltf.animation_reading import turns_nodes
 from torchface.io.gltf.gltf_document import read_document
 from torchface.io.gltf.performance_animation import Performance, performed_glb
-from torchface.io.rig_files import ANIMATION_ENDINGS, SCENE_ENDINGS, load_animation, save_animation
+from torchface.io.rig_files import ANIMATION_ENDINGS, GLTF_ENDINGS, SCENE_ENDINGS, load_animation, save_animation
 from torchface.io.scenes.weight_keys import weight_keys, with_correctives
 from torchface.io.tables.csv_table import TableReader
 from torchface.io.take_files import load_take
@@ -73,6 +74,12 @@ def load_weight_take(path: Path) -> Take:
         )
     check_whole_frames(path, take.weights)
     return take
+
+
+def unread_turns(path: Path) -> tuple[str, ...]:
+    """A line where an animated rig's head or eyes turn, of which :func:`load_weight_take` reads nothing."""
+    turns = path.suffix.lower() in GLTF_ENDINGS and turns_nodes(path)
+    return (f"{path}: the weights of its shapes are read, not how its head and eyes turn",) if turns else ()
 
 
 def without_shape(rig: BlendshapeRig, weights: Track | None) -> list[str]:

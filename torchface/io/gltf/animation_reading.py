@@ -120,6 +120,17 @@ def read_gltf_weights(path: str | Path) -> Take | None:
     return Take(frames.fps, weights=track, seconds=frames.seconds)
 
 
+def turns_nodes(path: str | Path) -> bool:
+    """Whether a file's animations turn nodes too, such as the head and the eyes."""
+    document = read_document(path)
+    for which, animation in enumerate(document.objects("animations")):
+        for number, row in enumerate(document.array(animation, "channels", f"animations[{which}]")):
+            location = f"animations[{which}].channels[{number}]"
+            if document.record(document.record(row, location).get("target"), location).get("path") == "rotation":
+                return True
+    return False
+
+
 def _meets(places: np.ndarray) -> bool:
     return bool(np.abs(places - np.rint(places)).max() <= _ON_FRAME)
 
