@@ -159,8 +159,8 @@ class WebcamSolver(WebcamSolverParts):
         Raises:
             ArgumentTypeError, ShapeError: an input is no tensor, or of another shape than one face in one picture has.
         """
-        given = (landmarks, deviation, visibility, presence, iris, openness, closed, eye_visibility, expression)
-        given += (expression_deviation, size, interval, controls)
+        given = [landmarks, deviation, visibility, presence, iris, openness, closed, eye_visibility, expression]
+        given += [expression_deviation, size, interval, controls]
         for value, (name, shape) in zip(given, _INPUTS.items(), strict=True):
             if checked_type(name, value, Tensor).shape != shape:
                 raise ShapeError(f"webcam solver: found {name} {tuple(value.shape)}, expected {shape}")
