@@ -50,7 +50,13 @@ class OtherCamera:
         inputs, name = self.inputs, self.camera.name or self.inputs.clip.path.stem
         state = TrackState(out / "state" / name, inputs.reading_key)
         reading, _ = read_frames(inputs, state, lambda what, *count: progress(f"{name}: {what}", *count))
-        own = frame_times(inputs, len(reading.landmarks))
+        found, count = int(reading.found.sum()), len(reading.landmarks)
+        if 2 * found < count:
+            film = inputs.clip.path.name
+            warnings.warn(
+                f"{film}: the face was found in {found} of its {count} frames: this camera adds little", stacklevel=2
+            )
+        own = frame_times(inputs, count)
         reading = judged_reading(inputs, reading, state.looks() if inputs.models.finder is not None else None).reading
         landmarks = smoothed_landmarks(inputs, reading, own).double()
         shown = torch.arange(len(landmarks)) / inputs.clip.fps if own is None else own
