@@ -44,6 +44,15 @@ def test_fixed_steps_come_near_the_exact_solve(solver: MarkerSolver) -> None:
     torch.testing.assert_close(graph(nothing, torch.full((1, 10), 0.25)), torch.full((1, 10), 0.25))
 
 
+def test_an_infinite_marker_is_one_that_is_not_seen(solver: MarkerSolver) -> None:
+    lost = random_frames(solver, 2)
+    lost[1, 4] = torch.nan
+    infinite, before = lost.clone(), torch.zeros(2, len(solver.names))
+    infinite[1, 4, 0] = torch.inf
+    graph = CorrectiveGraph(solver)
+    assert torch.equal(graph(infinite, before), graph(lost, before))
+
+
 def test_the_other_graph_is_refused(solver: MarkerSolver) -> None:
     with pytest.raises(ValueRangeError, match="found a rig with correctives"):
         SolverGraph(solver)

@@ -10,7 +10,7 @@ from torchface.capture.corrective_energy import CorrectiveEnergy
 from torchface.capture.markers.marker_solver import MarkerSolver
 from torchface.correctives.activation import RoundedActivation
 from torchface.errors import ValueRangeError
-from torchface.onnx.solver_graph import check_inputs, prediction_term
+from torchface.onnx.solver_graph import checked_markers, prediction_term
 from torchface.optim.fixed_splitting import FixedSplitting, fixed_loop
 from torchface.optim.operator_splitting import RHO
 
@@ -41,7 +41,7 @@ class CorrectiveGraph(nn.Module):
         self, markers: Tensor, previous: Tensor, predicted: Tensor | None = None, gamma: Tensor | None = None
     ) -> Tensor:
         """Weights in [0,1], (B,N); arguments and errors as of ``SolverGraph.forward``."""
-        check_inputs(self.solver, markers, previous, predicted, gamma)
+        markers = checked_markers(self.solver, markers, previous, predicted, gamma)
         start, shapes = previous.double().clamp(0.0, 1.0), len(self.solver.names)
         energy = self.solver.energy(markers)
         assert isinstance(energy, CorrectiveEnergy)

@@ -70,7 +70,7 @@ class SolverGraph(nn.Module):
         r"""Weights for markers, and for predictions where there are any.
 
         Args:
-            markers: (B,M,3), millimetres, in the order of the solver's labels; NaN for not seen.
+            markers: (B,M,3), millimetres, in the order of the solver's labels; NaN or infinity for not seen.
             previous: the weights of the frame before, (B,N); zeros where there is none.
             predicted: :math:`\tilde w`, (B,N); looked at where :math:`\gamma > 0`.
             gamma: :math:`\gamma`, (B,N), mm² over all markers; zero for the markers alone.
@@ -81,7 +81,7 @@ class SolverGraph(nn.Module):
         Raises:
             ShapeError: the shapes do not fit.
         """
-        check_inputs(self.solver, markers, previous, predicted, gamma)
+        markers = checked_markers(self.solver, markers, previous, predicted, gamma)
         start = previous.to(torch.promote_types(markers.dtype, self.solver.rest.dtype)).clamp(0.0, 1.0)
         missing = torch.isnan(markers).any(-1)
         own = missing.any()
@@ -113,10 +113,10 @@ def prediction_term(predicted: Tensor, gamma: Tensor, markers: int) -> Quadratic
     return pull_term(target.double(), gamma.double() / markers)
 
 
-def check_inputs(
+def checked_markers(
     solver: MarkerSolver, markers: Tensor, previous: Tensor, predicted: Tensor | None, gamma: Tensor | None
-) -> None:
-    """Raises ``ShapeError`` for inputs of a graph that do not fit the solver."""
+) -> Tensor:
+    """The markers, NaN where infinite; raises ``ShapeError`` for inputs of a graph that do not fit the solver."""
     for name, value in (("previous", previous), ("predicted", predicted), ("gamma", gamma)):
         if value is None:
             continue
@@ -127,3 +127,4 @@ def check_inputs(
                 f"solver graph: found markers {tuple(markers.shape)} and {name} {tuple(value.shape)}, "
                 f"expected (B,{len(solver.rest)},3) and (B,{len(solver.names)})"
             )
+    return torch.where(markers.isinf(), torch.nan, markers)
