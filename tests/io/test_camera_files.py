@@ -42,6 +42,8 @@ def test_there_and_back(kept: CameraCalibration, tmp_path: Path) -> None:
         ("912.3456789012345", '"long"', r"focal = \['long', "),
         ("651.5,", "651.5, 3.0,", "center = .*expected two numbers"),
         ("k3 =", "k4 =", "distortion.k4 = .*expected only k1, k2, p1, p2, k3"),
+        ("skew =", 'model = "fisheye"\nskew =', "model = 'fisheye', expected only format, width, height, focal"),
+        ("[distortion]", "[distorsion]", "distorsion = .*expected only"),
         ("torchface.camera/1", "torchface.camera/2", "found format 'torchface.camera/2'"),
         ("[distortion]", "[distortion", "not TOML"),
     ],

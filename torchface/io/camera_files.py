@@ -14,6 +14,8 @@ _MAX_BYTES = 2**16
 _MAX_SIDE = 2**16  # pixels
 _MAX_CAMERAS = 16
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
+_FIELDS = ("format", "width", "height", "focal", "skew", "center", "distortion", "error")
+_PLACE = ("name", "offset", "rotation", "translation")
 
 
 def save_calibration(calibration: CameraCalibration, path: str | Path) -> None:
@@ -115,6 +117,7 @@ def _calibration(document: Value, path: str | Path) -> CameraCalibration:
     table = document["distortion"].table(*_COEFFICIENTS) if document["distortion"] else {}
     distortion = [table[name].number() if name in table else 0.0 for name in _COEFFICIENTS]
     measured = error.number() if error else None
+    document.table(*_FIELDS, *_PLACE)  # a model of another lens, or a name that is misspelt, would count for nothing
     intrinsics = torch.tensor([[focal[0], skew, center[0]], [0, focal[1], center[1]], [0, 0, 1]], dtype=torch.float64)
     try:
         return CameraCalibration(intrinsics, torch.tensor(distortion, dtype=torch.float64), width, height, measured)

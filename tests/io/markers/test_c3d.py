@@ -309,7 +309,7 @@ def _broken(change: str) -> bytes:
     [
         ("no points", r"found no points .*expected at least one"),
         ("unknown unit", r"POINT:UNITS: found 'cubits', expected one of mm, cm, m, in"),
-        ("no unit", r"POINT:UNITS: found '', expected one of mm"),
+        ("no unit", r"POINT:UNITS: found '', expected one of mm, cm, m, in, um; or say it \(--unit, unit=\)"),
         ("nothing seen", r"found 3 points, none of them seen in any of 5 frames; expected at least one"),
         ("no frames", r"found no frames, expected at least one"),
         ("cut off", r"found 5 frames of 48 bytes announced and space for 4 .*expected all"),

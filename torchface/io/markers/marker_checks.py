@@ -35,7 +35,7 @@ def millimetres(file_unit: str, path: Path, field: str, unit: str | None) -> flo
     name = _SPELLINGS.get(name, name)
     if name not in UNITS:
         raise FileFormatError(
-            f"{path}: {field}: found {quoted([file_unit])}, expected one of {expected}; or give unit="
+            f"{path}: {field}: found {quoted([file_unit])}, expected one of {expected}; or say it (--unit, unit=)"
         )
     return UNITS[name]
 
