@@ -41,24 +41,6 @@ def test_parts_are_where_the_picture_shows_them() -> None:
     assert float((again.transform - found.transform).abs().max()) < 3
 
 
-def test_leaves_behind_a_head_are_no_hair() -> None:
-    angle = torch.linspace(0, 2 * math.pi, 69)[:68]
-    landmarks = torch.stack([50 + 20 * angle.cos(), 50 + 20 * angle.sin()], 1)
-
-    def all_hair(crops: Tensor) -> Tensor:
-        shares = torch.zeros(len(crops), len(PARTS), *crops.shape[2:])
-        shares[:, PARTS.index("hair")] = 1.0
-        return shares
-
-    image = torch.zeros(3, 100, 100, dtype=torch.uint8)
-    image[:, :, :50] = torch.tensor([44, 47, 35], dtype=torch.uint8)[:, None, None]  # leaves
-    image[:, :, 50:] = torch.tensor([47, 44, 35], dtype=torch.uint8)[:, None, None]
-    found = PartFinder(all_hair)(image, landmarks)
-    places = torch.tensor([[30.0, 50.0], [70.0, 50.0]])
-    torch.testing.assert_close(found.at(places, "hair"), torch.tensor([0.0, 1.0]))
-    torch.testing.assert_close(found.at(places, "background"), torch.tensor([1.0, 0.0]))
-
-
 def test_cloth_without_a_hue_over_the_nose_is_grey_hair() -> None:
     """The network takes grey hair for cloth."""
     head = neutral_head(texture=False)

@@ -1,7 +1,7 @@
 """Parts of the face in a photograph whose landmarks are known: skin, hair, brows, eyes, glasses, hands, cloth."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -13,7 +13,6 @@ from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.networks.part_network import PART_MARGIN, PART_SIZE, PARTS
 
 _GREY_HAIR = 0.25  # of its brightness, by which the channels of grey hair differ at most
-_GREEN = 0.008  # of full white, by which leaves are greener than red or blue
 _ROW = {name: number for number, name in enumerate(PARTS)}
 
 
@@ -71,19 +70,8 @@ class PartFinder:
         transform = crop_transform(box, float(tilt), PART_SIZE, PART_MARGIN)
         crop = cut_crop(image, transform, PART_SIZE).float() / 255
         both = self.network(torch.stack([crop, crop.flip(-1)]))
-        shares = _without_leaves((both[0] + both[1].flip(-1)) / 2, crop)
-        nose = known[30].double() @ transform[:, :2].T + transform[:, 2]
-        return FaceParts(_with_grey_hair(shares, crop, float(nose[1])), transform)
-
-
-def _without_leaves(shares: Tensor, crop: Tensor) -> Tensor:
-    """Shares (10,S,S) of a crop (3,S,S) in which what is green is background and no hair, as leaves behind a head."""
-    green = crop[1] > crop[[0, 2]].amax(0) + _GREEN
-    hair, background = _ROW["hair"], _ROW["background"]
-    shares = shares.clone()
-    shares[background] += torch.where(green, shares[hair], 0.0)
-    shares[hair] *= ~green
-    return shares
+        found = FaceParts((both[0] + both[1].flip(-1)) / 2, transform)
+        return replace(found, shares=_with_grey_hair(found.shares, crop, float(found.in_crop(known[30])[1])))
 
 
 def _with_grey_hair(shares: Tensor, crop: Tensor, nose: float) -> Tensor:
