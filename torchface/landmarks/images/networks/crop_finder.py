@@ -28,7 +28,8 @@ class BothSides:
 
     def __call__(self, crops: Tensor) -> NetworkLandmarks:
         last = crops.shape[-1] - 1
-        upright, mirrored = self.network(crops), self.network(crops.flip(-1).contiguous())
+        both = self.network(torch.cat([crops, crops.flip(-1)]))  # at once, which is a sixth quicker
+        upright, mirrored = (NetworkLandmarks(*half) for half in zip(*(one.chunk(2) for one in both), strict=True))
         rows, twins = list(MIRROR_68), _TWINS
         landmarks, deviation = _merged(upright[:2], (mirrored.landmarks[:, rows], mirrored.deviation[:, rows]), last)
         across = mirrored.points[:, self.mirror], mirrored.point_deviation[:, self.mirror]
