@@ -163,6 +163,14 @@ def test_of_several_faces_the_one_asked_for_is_followed(filmed: Filmed, tmp_path
     assert "camera: none given; assumed a field of view of 60 degrees" in told
 
 
+def test_a_camera_that_is_given_without_its_error_is_named(done: Done) -> None:
+    inputs = done.tracked.inputs
+    given = replace(inputs, calibration=replace(inputs.calibration, error=None))
+    told = " ".join(replace(done.tracked, inputs=given).lines())
+    assert "camera: from camera.toml, of unknown error" in told
+    assert "none given" not in told
+
+
 def test_the_verdict_comes_first(done: Done) -> None:
     tracked = done.tracked
     assert tracked.lines()[0] == tracked.verdict()

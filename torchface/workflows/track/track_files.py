@@ -90,7 +90,7 @@ def summary(tracked: Tracked) -> dict[str, object]:
         "jitter_px": tracked.jitter,
         "reprojection_median_px": float(errors.nanmedian()),
         "reprojection_95_px": float(errors.nanquantile(0.95)),
-        "camera_assumed": tracked.calibration.assumed,
+        "camera_assumed": tracked.camera_source == "assumed",
         "focal_px": float(tracked.calibration.intrinsics[0, 0]),
         "intrinsics": tracked.calibration.intrinsics.tolist(),
         "distortion": tracked.calibration.distortion.tolist(),

@@ -87,7 +87,7 @@ def figures(tracked: Tracked) -> list[tuple[str, str]]:
         ("reprojection error, 95th percentile", f"{float(errors.nanquantile(0.95)):.2f} px"),
         ("weights at 0", f"{100 * float((weights <= 1e-3).float().mean()):.0f} %"),
         ("weights at 1", f"{100 * float((weights >= 1 - 1e-3).float().mean()):.1f} %"),
-        ("camera", "assumed" if camera.assumed else tracked.camera_source),
+        ("camera", tracked.camera_source),
         ("focal length", f"{float(camera.intrinsics[0, 0]):.0f} px"),
         ("faces in the first frame", str(tracked.faces)),
     ]

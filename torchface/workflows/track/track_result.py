@@ -88,10 +88,12 @@ class Tracked:
 
     @property
     def camera_source(self) -> str:
-        """What a measured camera is from, and its error."""
-        file = self.inputs.settings.camera or self.inputs.settings.cameras
+        """What a camera is from, and its error; "assumed" where none was given."""
+        file, error = self.inputs.settings.camera or self.inputs.settings.cameras, self.calibration.error
+        if file is None and error is None:
+            return "assumed"
         found = "as given" if file is None else f"from {file.name}"
-        return f"{found}, {self.calibration.error:.2f} px off when it was made"
+        return f"{found}, " + ("of unknown error" if error is None else f"{error:.2f} px off when it was made")
 
     @property
     def finder(self) -> str:
@@ -236,7 +238,7 @@ class Tracked:
             )
         if "overlay" in self.products:
             lines.extend(sound_line(self.video.path, self.products["overlay"]))
-        if self.calibration.assumed:
+        if self.camera_source == "assumed":
             lines.append(
                 f"camera: none given; assumed a field of view of {self.calibration.field_of_view:.0f} degrees "
                 f"(focal length {float(self.calibration.intrinsics[0, 0]):.0f} px), so distances are rough "
