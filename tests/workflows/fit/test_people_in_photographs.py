@@ -1,6 +1,7 @@
 """Two people, another photograph's landmarks, a dark or a grey picture: none passes without a word."""
 
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -12,14 +13,17 @@ from torchface import load_rig, zoo
 from torchface.errors import AlignmentError
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io import load_identity_modes, load_image, save_image
-from torchface.io.video import open_video
+from torchface.io.video import open_video, write_video
 from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel, fit_images
+from torchface.progress import silent
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
 from torchface.workflows.fit import fit_checks
 from torchface.workflows.fit.fit_checks import ALONE, one_person_lines
 from torchface.workflows.fit.fit_landmarks import landmarks_of
 from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs
+from torchface.workflows.fit.picture_checks import picture_lines
+from torchface.workflows.fit.video_pictures import video_pictures
 from torchface.workflows.named_heads import load_head_model, matching
 
 PEOPLE = ("einstein.jpg", "lfpw_1.png", "lfpw_2.png", "takeo.ppm")
@@ -142,6 +146,29 @@ def test_a_smile_does_not_make_another_person(data: Path, tmp_path: Path) -> Non
     settings = PhotographSettings(fit=FitSettings(texture_size=0))
     made = fit_photographs(photographs, [], "head", tmp_path / "rig.glb", settings)
     assert not any("different people" in line for line in made.remarks), made.remarks
+
+
+@pytest.mark.real
+def test_a_film_with_a_cut_to_another_person_is_warned_of(data: Path, tmp_path: Path) -> None:
+    man, other = (
+        list(islice(open_video(data / "video" / name).color_frames(), count))
+        for name, count in (("single_face.mp4", 9), ("webcam/head_pose_male.gif", 3))  # the sharper half is fitted
+    )
+    height, width = other[0].shape[1:]
+    small = torch.nn.functional.interpolate(torch.stack(man).float() / 255, (height, width), mode="area")
+    film = write_video([small, torch.stack(other).float() / 255], tmp_path / "cut.mkv", 12.0)
+    settings = PhotographSettings(fit=FitSettings(texture_size=0))
+    made = fit_photographs([Path(film.path)], [], "head", tmp_path / "rig.glb", settings)
+    assert any("may show different people" in line for line in made.remarks), made.remarks
+
+
+@pytest.mark.real
+def test_a_film_of_two_people_names_the_other(data: Path) -> None:
+    _, rig = matching(load_head_model("head"))
+    film, rest = data / "video" / "webcam" / "head_pose_two.gif", rig.vertices[rig.neutral.landmarks]
+    pictures = video_pictures(film, rest, silent).found
+    (line,) = (line for one in pictures for line in picture_lines(one) if "faces" in line)
+    assert "the largest of 2 faces is taken, 1 more nearly as large (--face 1)" in line
 
 
 def test_exact_landmarks_of_one_head_are_of_one_person() -> None:

@@ -92,17 +92,16 @@ def one_person_lines(
     alone: Sequence[ImageFit],
     bare: BareFit,
     insist: bool = False,
-    expected: float = ONE_PERSON,
     colors: Tensor | None = None,
 ) -> list[str]:
-    """Whether photographs that were fitted together show one person, for people to read; nothing if that is as
-    likely as expected. Each is fitted alone too; colours (I,4) are those of ``part_colors``."""
+    """Whether photographs that were fitted together show one person, for people to read; nothing if that is likely.
+    Each is fitted alone too; colours (I,4) are those of ``part_colors``."""
     if len(photographs) < 2:
         return []
     form = same_person(alone)
     sure = form.sigmoid()
     both = sure if colors is None else (form.clamp(max=FORM_SAYS) + color_evidence(colors)).sigmoid()
-    if float(both.min()) >= expected and float(sure.min()) >= DOUBTED:
+    if float(both.min()) >= ONE_PERSON and float(sure.min()) >= DOUBTED:
         return []
     joint = float(misfits(bare(marks, list(range(len(marks))))).square().mean().sqrt())
     each = float(torch.stack([misfits(fit)[0] for fit in alone]).square().mean().sqrt())
@@ -113,7 +112,7 @@ def one_person_lines(
     colored = "" if colors is None else f", with the colours of hair, brows and lips {with_colors}"
     figures = (
         f"probability that each shows the person of the others, by the form of the heads {listed}{colored}, expected "
-        f"above {expected:.0%}; landmarks lie {joint:.1%} of the eyes' distance from one head "
+        f"above {ONE_PERSON:.0%}; landmarks lie {joint:.1%} of the eyes' distance from one head "
         f"for all, {each:.1%} from a head for each"
     )
     others = (both < OTHERS) & (form < 0)

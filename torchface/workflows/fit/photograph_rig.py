@@ -31,8 +31,6 @@ from torchface.viz.figures.landmark_dots import with_dots
 from torchface.workflows.fit.color_evidence import part_colors
 from torchface.workflows.fit.fit_checks import (
     ALONE,
-    DOUBTED,
-    ONE_PERSON,
     eyes_distances,
     landmark_lines,
     one_person_lines,
@@ -242,10 +240,9 @@ def fit_photographs(
     remarks += sharpness_lines(photographs, images, marks) if found else []
     alone = [bare(marks[i : i + 1], [i]) for i in range(len(marks))]
     remarks += width_lines(photographs, alone, heads, rig.neutral.landmarks)
-    # The tracker has followed one face through a film.
-    expected = DOUBTED if one_film else ONE_PERSON
-    colors = None if one_film else torch.stack([part_colors(*one) for one in zip(images, parts, strict=True)])
-    remarks += one_person_lines(photographs, marks, alone, bare, insist or one_film, expected, colors)
+    colors = torch.stack([part_colors(*one) for one in zip(images, parts, strict=True)])
+    # Nobody can leave out a frame of a film.
+    remarks += one_person_lines(photographs, marks, alone, bare, insist or one_film, colors)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)
     remarks += angle_lines(fit)
     if found:
@@ -292,7 +289,7 @@ def _pictures(
     for path in paths:
         if path.suffix.lower() in VIDEO_ENDINGS:
             rest = rig.vertices[rig.neutral.landmarks].detach()
-            some = video_pictures(path, rest, progress, settings.landmark_model, settings.face or 0)
+            some = video_pictures(path, rest, progress, settings.landmark_model, settings.face)
             names, images, found = names + some.names, images + some.images, found + some.found
             continue
         names, images = [*names, path], [*images, load_image(path)]

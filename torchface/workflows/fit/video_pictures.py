@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.io.video import open_video
-from torchface.landmarks import FaceReading, LandmarkTracker
+from torchface.landmarks import FaceReading, LandmarkTracker, find_faces
 from torchface.landmarks.images.tracking.video_landmarks import naming_the_frame
 from torchface.modeling.photographs.frame_choice import choose_frames
 from torchface.progress import Progress
@@ -31,21 +31,25 @@ class VideoPictures:
 
 
 def video_pictures(
-    video: Path, rest: Tensor, progress: Progress, model: str | Path = DEFAULT_LANDMARKS, face: int = 0
+    video: Path, rest: Tensor, progress: Progress, model: str | Path = DEFAULT_LANDMARKS, face: int | None = None
 ) -> VideoPictures:
     """Chooses frames of a video to fit a head, of landmarks (68,3) at rest, to; ``face`` is which of several, the
-    largest first."""
+    largest first. The first picture knows all faces of the frame in which the face was first seen."""
     clip = open_video(video)
     clip.check()
     named = load_finder(model, option="landmark model")
     step = max(-(-clip.count // _READ), 1)
-    tracker = LandmarkTracker(named.finder, face=face, fps=clip.fps / step)
+    which_face = face or 0
+    tracker = LandmarkTracker(named.finder, face=which_face, fps=clip.fps / step)
     readings, sharpness, numbers = [], [], []
+    several: Tensor | None = None
     for number, frame in enumerate(clip.color_frames()):  # a frame's box is the one before's
         if number % step:
             continue
         with naming_the_frame(number):
             readings.append(tracker.step(frame))
+        if several is None and bool(readings[-1].found):
+            several = find_faces(frame).boxes
         numbers.append(number)
         sharpness.append(sharpness_of(frame, readings[-1].box) if bool(readings[-1].found) else torch.zeros(()))
         progress("finding the face in the video", number + 1, max(clip.count, number + 1))
@@ -63,8 +67,12 @@ def video_pictures(
         pictures.names.append(name)
         pictures.images.append(frame.float() / 255)
         size = (frame.shape[2], frame.shape[1])
-        boxes = reading.box[None]
-        pictures.found.append(PhotographLandmarks(name, str(model), reading, 0, boxes, size, places=named.places))
+        which, boxes = 0, reading.box[None]
+        if several is not None and len(several) > which_face:
+            which, boxes, several = which_face, several, None
+        pictures.found.append(
+            PhotographLandmarks(name, str(model), reading, which, boxes, size, face is not None, named.places)
+        )
     return pictures
 
 
