@@ -116,11 +116,12 @@ def test_a_dark_photograph_makes_a_poor_result_and_a_name_that_says_so_does_not(
 
 @pytest.mark.real
 def test_a_grey_photograph_is_warned_of_where_its_landmarks_are_given(data: Path, tmp_path: Path) -> None:
-    folder, settings = data / "images" / "people", PhotographSettings(fit=FitSettings(texture_size=0))
+    folder, settings = data / "images" / "people", PhotographSettings(fit=FitSettings(texture_size=0), focal=700.0)
     photograph, marks = load_image(folder / "lfpw_2.png"), [folder / "lfpw_2.pts"]
     save_image(photograph.mean(0).expand(3, -1, -1).contiguous(), tmp_path / "a.png")
     made = fit_photographs([tmp_path / "a.png"], marks, None, tmp_path / "rig.glb", settings)
     assert any("no colours: the skin is grey" in line for line in made.remarks), made.remarks
+    assert not any(line.startswith("focal length: a guess") for line in made.lines())
 
 
 @pytest.mark.real
@@ -146,6 +147,7 @@ def test_a_smile_does_not_make_another_person(data: Path, tmp_path: Path) -> Non
     settings = PhotographSettings(fit=FitSettings(texture_size=0))
     made = fit_photographs(photographs, [], "head", tmp_path / "rig.glb", settings)
     assert not any("different people" in line for line in made.remarks), made.remarks
+    assert any(line.startswith("focal length: a guess") for line in made.lines())
 
 
 @pytest.mark.real

@@ -111,6 +111,7 @@ class FittedHead:
     grey: bool = False  # whether all of them are black and white
     stray: bool = False  # whether given landmarks are not on a face
     dark: bool = False  # whether one of them is too dark to show the skin's colour
+    focal_given: bool = False
 
     def verdict(self) -> str:
         """Whether the head is to be used, in a line; no landmark says whether skin and likeness are right."""
@@ -137,6 +138,11 @@ class FittedHead:
             lines.append(
                 f"{path.name}: landmarks {error:.2f} pixels off ({error / eyes:.1%} of the eyes' distance; "
                 f"{inner / eyes:.1%} without the contour), focal length {float(camera.intrinsics[0, 0]):.0f}"
+            )
+        if not self.focal_given:
+            lines.append(
+                "focal length: a guess by the face's perspective; two head models differ in it by a factor of 0.6 to "
+                "1.8 (24 photographs), and in the distance to the camera; give --focal where you know it"
             )
         lines += self.remarks
         most = float(fit.coefficients.abs().max())
@@ -277,6 +283,7 @@ def fit_photographs(
         without_colors(images),
         stray,
         dark,
+        settings.focal is not None,
     )
 
 
