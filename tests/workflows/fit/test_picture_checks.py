@@ -25,6 +25,7 @@ from torchface.workflows.fit.picture_checks import (
     color_lines,
     cover_lines,
     edge_lines,
+    forehead_lines,
     light_lines,
     picture_lines,
 )
@@ -175,6 +176,16 @@ def test_a_face_that_the_pictures_edge_cuts_is_no_face_behind_a_hand() -> None:
     square = torch.tensor([[20.0, 20.0], [20.0, 80.0], [80.0, 80.0], [80.0, 20.0]])
     assert cover_lines(Path("a.png"), parts, square)
     assert cover_lines(Path("a.png"), parts, square, cut=True) == []
+
+
+def test_a_forehead_that_the_pictures_edge_cuts_is_remarked_on_whatever_the_tilt() -> None:
+    marks = torch.full((68, 2), 60.0)
+    marks[[8, 27, 36, 45]] = torch.tensor([[50.0, 95.0], [50.0, 40.0], [35.0, 42.0], [65.0, 42.0]])
+    assert forehead_lines(Path("a.png"), (100, 100), marks) == []
+    cut = marks - torch.tensor([0.0, 20.0])  # 20 pixels above the eyes
+    for points in (cut, cut.flip(1), 99 - cut):
+        (line,) = forehead_lines(Path("a.png"), (100, 100), points)
+        assert "a.png: the picture's edge cuts off the forehead" in line
 
 
 def test_landmarks_that_no_head_has_are_remarked_on() -> None:

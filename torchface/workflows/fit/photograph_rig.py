@@ -52,6 +52,7 @@ from torchface.workflows.fit.picture_checks import (
     color_lines,
     cover_lines,
     edge_lines,
+    forehead_lines,
     grey_lines,
     light_lines,
     picture_lines,
@@ -164,7 +165,7 @@ class FittedHead:
             what = f"the template's {cut}, not the person's" if worn else "painted on the head as a cap"
             lines.append(f"hair: {_code(fit.hair)}, its {seen}; {what}")
         elif fit.mesh.texture is not None:
-            lines.append("hair: none seen over the brows; the network that looks for it misses grey hair at times")
+            lines.append("hair: none seen over the brows: bald, covered, or grey, which the network may miss")
         if fit.iris is not None:
             lines.append(f"irises: {_code(fit.iris)}, their {seen}")
         elif fit.mesh.texture is not None:
@@ -237,6 +238,7 @@ def fit_photographs(
     whole = [one.face.landmarks for one in found] or marks
     for photograph, image, shown, points, every in zip(photographs, images, parts, marks, whole, strict=True):
         edge = edge_lines(photograph, (image.shape[2], image.shape[1]), every)
+        remarks += [] if edge else forehead_lines(photograph, (image.shape[2], image.shape[1]), every)
         # Given landmarks may lie off the face, where grain says nothing.
         remarks += (color_lines if found else grey_lines)(photograph, image, shown, points)
         remarks += [*edge, *cover_lines(photograph, shown, points, bool(edge))]
