@@ -17,6 +17,9 @@ from torchface.onnx.corrective_graph import CorrectiveGraph
 from torchface.onnx.solver_graph_export import export_marker_solver, hide_markers, random_frames, solver_model
 from torchface.synthetic import performer
 
+SIDES = ("Left", "Right")
+MOUTH = ["jawOpen", "jawLeft", "jawRight", "mouthClose", "mouthFunnel", "mouthPucker", "cheekPuff", "browInnerUp"]
+
 
 @pytest.fixture(scope="module")
 def solver() -> MarkerSolver:
@@ -51,6 +54,24 @@ def test_an_infinite_marker_is_one_that_is_not_seen(solver: MarkerSolver) -> Non
     infinite[1, 4, 0] = torch.inf
     graph = CorrectiveGraph(solver)
     assert torch.equal(graph(infinite, before), graph(lost, before))
+
+
+def test_shapes_that_move_markers_nearly_alike_are_solved_from_cold() -> None:
+    rig = performer(texture=False).select(
+        [f"mouth{name}{side}" for name in ("Smile", "Frown") for side in SIDES] + MOUTH
+    )
+    jaw, funnel = (rig.deltas[rig.names.index(name)] for name in ("jawOpen", "mouthFunnel"))
+    rig = BlendshapeRig(rig.neutral, torch.cat([rig.deltas, (jaw / 3 + funnel / 10)[None]]), (*rig.names, "tongue"))
+    rig = BlendshapeRig(rig.neutral, rig.deltas, rig.names, planted_correctives(rig, 4))
+    solver = MarkerSolver(rig, Attachment.from_vertices(rig.neutral, rig.neutral.landmarks[17:]))
+    weights = torch.zeros(60, len(rig.names))
+    weights[:, rig.names.index("jawOpen")] = torch.linspace(0.2, 0.8, 60)
+    for side in SIDES:
+        weights[:, rig.names.index(f"mouthSmile{side}")] = torch.linspace(0.0, 0.9, 60)
+    markers = solver.points(weights).float()
+    markers += 0.3 * torch.randn(markers.shape, generator=torch.Generator().manual_seed(0))
+    found = CorrectiveGraph(solver)(markers, torch.zeros_like(weights))
+    torch.testing.assert_close(found, solver(markers), atol=0.01, rtol=0)
 
 
 def test_the_other_graph_is_refused(solver: MarkerSolver) -> None:

@@ -12,11 +12,10 @@ from torchface.correctives.activation import RoundedActivation
 from torchface.errors import ValueRangeError
 from torchface.onnx.solver_graph import checked_markers, prediction_term
 from torchface.optim.fixed_splitting import FixedSplitting, fixed_loop
-from torchface.optim.operator_splitting import RHO
 
 STEPS = 6
-_ROUNDED_STEPS, _LINEAR_SPLITTING, _SPLITTING = 2, 60, 40
-_LENGTHS = (1.0, 0.5, 0.15)
+_ROUNDED_STEPS, _LINEAR_SPLITTING, _SPLITTING = 2, 60, 60
+_RHO, _LENGTHS = 0.04, (1.0, 0.5, 0.15)  # shapes that move markers nearly alike need a small rho
 
 
 class CorrectiveGraph(nn.Module):
@@ -31,11 +30,11 @@ class CorrectiveGraph(nn.Module):
         super().__init__()
         if solver.activation is None:
             raise ValueRangeError("corrective graph: found a rig without correctives, expected some; see SolverGraph")
-        self.solver, self.steps, self.rho = copy.deepcopy(solver), (steps, steps), RHO
+        self.solver, self.steps, self.rho = copy.deepcopy(solver), (steps, steps), _RHO
         activation = copy.deepcopy(solver.activation)
         self.rounded = RoundedActivation(activation) if len(activation.in_betweens) else activation
         self.linear = FixedSplitting(steps=_LINEAR_SPLITTING)
-        self.splitting = FixedSplitting(steps=_SPLITTING)
+        self.splitting = FixedSplitting(steps=_SPLITTING, rho=_RHO)
 
     def forward(
         self, markers: Tensor, previous: Tensor, predicted: Tensor | None = None, gamma: Tensor | None = None
