@@ -1,6 +1,11 @@
 """A graph of the agreed signature finds landmarks in turned crops; one of another signature is told what it has."""
 
+import json
 import math
+import struct
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +16,8 @@ from onnx import TensorProto, helper, numpy_helper
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
 from torchface.landmarks.images.face_crop import crop_transform, cut_crop, from_crop
-from torchface.landmarks.images.networks.onnx_finder import onnx_finder
+from torchface.landmarks.images.networks import graph_process
+from torchface.landmarks.images.networks.onnx_finder import GraphLimits, onnx_finder
 from torchface.workflows.named_finders import load_finder
 
 S = 16
@@ -107,3 +113,70 @@ def test_other_graphs_are_told_what_they_have(tmp_path: Path) -> None:
         make()
         with pytest.raises(FileFormatError, match=message):
             onnx_finder(path)
+
+
+def hostile(path: Path, grown: int, loops: bool) -> Path:
+    """A graph of the right signature whose visibility is gathered from so many numbers, or that never ends."""
+    info, F, I = helper.make_tensor_value_info, TensorProto.FLOAT, TensorProto.INT64
+    body = helper.make_graph(
+        [helper.make_node("Identity", ["go"], ["goes_on"]), helper.make_node("Sin", ["x"], ["y"])],
+        "body",
+        [info("i", I, []), info("go", TensorProto.BOOL, []), info("x", F, None)],
+        [info("goes_on", TensorProto.BOOL, []), info("y", F, None)],
+    )
+    nodes = [
+        helper.make_node("ReduceMean", ["image"], ["presence"], axes=[1, 2, 3], keepdims=0),
+        helper.make_node("Reshape", ["presence", "one"], ["level"]),
+        helper.make_node("Loop", ["", "always", "level"], ["level_after"], body=body)
+        if loops
+        else helper.make_node("Identity", ["level"], ["level_after"]),
+        helper.make_node("Expand", ["level_after", "many"], ["grown"]),
+        helper.make_node("Sin", ["grown"], ["waves"]),
+        helper.make_node("Slice", ["waves", "from", "to"], ["some"]),
+        helper.make_node("Reshape", ["some", "row"], ["visibility"]),
+        helper.make_node("Identity", ["visibility"], ["deviation"]),
+        helper.make_node("Reshape", ["visibility", "cube"], ["visibility_column"]),
+        helper.make_node("Add", ["visibility_column", "points"], ["landmarks"]),
+    ]
+    values = {"one": [1], "many": [grown], "from": [0], "to": [68], "row": [1, 68], "cube": [1, 68, 1]}
+    constants = [numpy_helper.from_array(np.array(value), name) for name, value in values.items()]
+    constants += [numpy_helper.from_array(POINTS[None], "points"), numpy_helper.from_array(np.array(True), "always")]
+    outputs = {"landmarks": [1, 68, 2], "deviation": [1, 68], "visibility": [1, 68], "presence": [1]}
+    made = helper.make_graph(
+        nodes,
+        "hostile",
+        [info("image", F, [1, 3, S, S])],
+        [info(name, F, shape) for name, shape in outputs.items()],
+        constants,
+    )
+    onnx.save(helper.make_model(made, opset_imports=[helper.make_opsetid("", 17)], ir_version=8), path)
+    return path
+
+
+def test_a_graph_that_takes_too_much_is_ended(tmp_path: Path) -> None:
+    """Gigabytes, or a loop without an end; the same graph of a usual size is used."""
+    harmless = onnx_finder(hostile(tmp_path / "small.onnx", 100, loops=False))
+    assert harmless.network(torch.full((1, 3, S, S), 0.5))[2].shape == (1, 68)
+    if sys.platform == "linux":
+        with pytest.raises(FileFormatError, match=r"large.onnx: .*(cannot be run|ended with|memory)"):
+            onnx_finder(hostile(tmp_path / "large.onnx", 2**29, loops=False), GraphLimits(megabytes=512))
+    begin = time.perf_counter()
+    with pytest.raises(FileFormatError, match=r"loop.onnx: the graph, .* gave no answer in 1.5 seconds"):
+        onnx_finder(hostile(tmp_path / "loop.onnx", 100, loops=True), GraphLimits(load_seconds=1.5))
+    assert time.perf_counter() - begin < 10
+
+
+def test_a_graph_that_never_ends_ends_with_its_parent(tmp_path: Path) -> None:
+    """Killed, the parent cannot end what runs the graph: it ends where its input does."""
+    graph = hostile(tmp_path / "loop.onnx", 100, loops=True).read_bytes()
+    crop = graph_process.packed(np.full((1, 3, S, S), 0.5, np.float32))
+    command = [sys.executable, "-I", graph_process.__file__, "512"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        process.stdin.write(b"".join(struct.pack("<Q", len(one)) + one for one in (graph, crop)))
+        process.stdin.flush()
+        (count,) = struct.unpack("<I", process.stdout.read(4))
+        assert json.loads(process.stdout.read(count))["inputs"] == [["image", [1, 3, S, S], "tensor(float)"]]
+        with pytest.raises(subprocess.TimeoutExpired):
+            process.wait(0.3)
+        process.stdin.close()
+        assert process.wait(30) == 0
