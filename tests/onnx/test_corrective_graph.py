@@ -12,7 +12,7 @@ from torchface.capture import HybridSolver, MarkerSolver
 from torchface.correctives import Corrective, Correctives
 from torchface.errors import ValueRangeError
 from torchface.landmarks.images.graph_session import graph_session
-from torchface.onnx import SolverGraph
+from torchface.onnx import SolverGraph, corrective_graph
 from torchface.onnx.corrective_graph import CorrectiveGraph
 from torchface.onnx.solver_graph_export import export_marker_solver, hide_markers, random_frames, solver_model
 from torchface.synthetic import performer
@@ -56,22 +56,37 @@ def test_an_infinite_marker_is_one_that_is_not_seen(solver: MarkerSolver) -> Non
     assert torch.equal(graph(infinite, before), graph(lost, before))
 
 
-def test_shapes_that_move_markers_nearly_alike_are_solved_from_cold() -> None:
+@pytest.fixture(scope="module")
+def alike() -> MarkerSolver:
+    """Of a rig whose jawOpen, mouthFunnel and tongue move the markers nearly alike."""
     rig = performer(texture=False).select(
         [f"mouth{name}{side}" for name in ("Smile", "Frown") for side in SIDES] + MOUTH
     )
     jaw, funnel = (rig.deltas[rig.names.index(name)] for name in ("jawOpen", "mouthFunnel"))
     rig = BlendshapeRig(rig.neutral, torch.cat([rig.deltas, (jaw / 3 + funnel / 10)[None]]), (*rig.names, "tongue"))
     rig = BlendshapeRig(rig.neutral, rig.deltas, rig.names, planted_correctives(rig, 4))
-    solver = MarkerSolver(rig, Attachment.from_vertices(rig.neutral, rig.neutral.landmarks[17:]))
-    weights = torch.zeros(60, len(rig.names))
-    weights[:, rig.names.index("jawOpen")] = torch.linspace(0.2, 0.8, 60)
+    return MarkerSolver(rig, Attachment.from_vertices(rig.neutral, rig.neutral.landmarks[17:]))
+
+
+def test_shapes_that_move_markers_nearly_alike_are_solved_from_cold(alike: MarkerSolver) -> None:
+    weights = torch.zeros(60, len(alike.names))
+    weights[:, alike.names.index("jawOpen")] = torch.linspace(0.2, 0.8, 60)
     for side in SIDES:
-        weights[:, rig.names.index(f"mouthSmile{side}")] = torch.linspace(0.0, 0.9, 60)
-    markers = solver.points(weights).float()
+        weights[:, alike.names.index(f"mouthSmile{side}")] = torch.linspace(0.0, 0.9, 60)
+    markers = alike.points(weights).float()
     markers += 0.3 * torch.randn(markers.shape, generator=torch.Generator().manual_seed(0))
-    found = CorrectiveGraph(solver)(markers, torch.zeros_like(weights))
-    torch.testing.assert_close(found, solver(markers), atol=0.01, rtol=0)
+    found = CorrectiveGraph(alike)(markers, torch.zeros_like(weights))
+    torch.testing.assert_close(found, alike(markers), atol=0.01, rtol=0)
+
+
+def test_the_frames_that_a_graph_is_checked_with_show_one_that_stops_too_early(
+    alike: MarkerSolver, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(corrective_graph, "_RHO", 0.12)
+    monkeypatch.setattr(corrective_graph, "_SPLITTING", 40)
+    markers = random_frames(alike, 48, seed=1)
+    found = CorrectiveGraph(alike)(markers, torch.zeros(48, len(alike.names)))
+    assert (found - alike(markers)).abs().max() > 0.05
 
 
 def test_the_other_graph_is_refused(solver: MarkerSolver) -> None:

@@ -40,7 +40,7 @@ _USUAL = 1e-3  # of the energy: 0.0003 mm of a marker error of 0.5 mm
 _ROUNDINGS = 10.0
 _FAR = 0.05  # of a weight from the exact solve's: seen in an animation
 _TEST_FRAMES, _CORRECTIVE_FRAMES = 512, 48
-_FRAMES_A_POSE = 10
+_FRAMES_A_POSE, _ACTIVE = 10, (0.2, 0.7)  # shares of the shapes that every other pose has
 _MISSING = (0.0, 0.1, 0.3)
 
 
@@ -170,7 +170,7 @@ def export_solver(
         attachment: M markers.
         path: the file to write; it appears only when it is complete and checked.
         steps: of the graph's solve; a rig with correctives takes ``CorrectiveGraph``'s.
-        markers: frames to check with, (T,M,3), without gaps; random sparse weights and 0.3 mm of noise if absent.
+        markers: frames to check with, (T,M,3), without gaps; random weights and 0.3 mm of noise if absent.
         hybrid: the hybrid solve, checked with random predictions for a seventh of the weights. ``export_model`` writes
             a ``MarkerSolver`` with an alignment or other penalties.
 
@@ -308,10 +308,11 @@ def choose_rho(solver: MarkerSolver, steps: int, markers: Tensor) -> float:
 
 
 def random_frames(solver: MarkerSolver, count: int, noise: float = 0.3, seed: int = 0) -> Tensor:
-    """Markers (T,M,3) that move from one random sparse pose to the next, with noise in millimetres, in marker space."""
+    """Markers (T,M,3) that move from a random pose of few shapes to one of many, and so on, with noise in millimetres,
+    in marker space."""
     generator = torch.Generator().manual_seed(seed)
     poses = (count // _FRAMES_A_POSE + 2, len(solver.names))
-    active = torch.rand(poses, generator=generator) < 0.2
+    active = torch.rand(poses, generator=generator) < torch.tensor(_ACTIVE)[torch.arange(poses[0]) % 2, None]
     keys = active * torch.rand(poses, generator=generator).square()
     time_ = torch.arange(count) / _FRAMES_A_POSE
     before, share = time_.long(), time_.frac()[:, None]
