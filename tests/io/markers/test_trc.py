@@ -43,6 +43,12 @@ def test_a_file_as_opensim_writes_it_is_read(line_end: str, tmp_path: Path) -> N
     assert metres.markers.values[0, 1].tolist() == [4000, 5000, 6000]
 
 
+def test_times_of_another_rate_than_the_header_says_count_and_are_named(tmp_path: Path) -> None:
+    (tmp_path / "take.trc").write_text(_OPENSIM.replace("59.94\t59.94\t3\t2", "120\t59.94\t3\t2"))
+    with pytest.warns(UserWarning, match=r"found DataRate 120 and times of 59\.94\d* frames a second"):
+        assert load_trc(tmp_path / "take.trc").fps == pytest.approx(59.94, abs=0.01)
+
+
 def test_dropped_frames_leave_the_others_their_times_and_numbers(tmp_path: Path) -> None:
     (tmp_path / "take.trc").write_text(_OPENSIM.replace("\n3\t0.03337", "\n7\t0.10010"))
     take = load_trc(tmp_path / "take.trc")

@@ -1,5 +1,6 @@
 """Marker takes in TRC files, tab-separated text of Motion Analysis and OpenSim."""
 
+import warnings
 from array import array
 from collections.abc import Iterator
 from itertools import islice
@@ -65,6 +66,12 @@ def load_trc(path: str | Path, unit: str | None = None) -> Take:
     table = np.frombuffer(numbers).reshape(count, len(columns))
     extras = numbering_extras(table[:, 0], first=1, where=str(path))
     times = frame_times(table[:, 1], TimeSource(file_error(path), table[:, 0], fps))
+    if count > 1 and not 0.9 < times.fps / fps < 1.1:
+        warnings.warn(
+            f"{path}: found DataRate {fps:g} and times of {times.fps:g} frames a second, expected the same: "
+            "the times count",
+            stacklevel=2,
+        )
     return marker_take(path, times, unique_labels(labels), _scaled(table[:, 2:], factor), extras, factor)
 
 
