@@ -1,6 +1,7 @@
 """A run that was killed goes on, what is up to date is kept, and damaged files are made anew."""
 
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ from safetensors.torch import load_file
 from tests.workflows.track.conftest import FRAMES, PIECE, Done, Filmed
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.video import open_video
+from torchface.io.video.video_file import VideoFile
 from torchface.landmarks import FaceReading, LandmarkTracker
 from torchface.workflows.named_finders import graph_detector, load_finder
 from torchface.workflows.track import frame_readings
@@ -29,13 +31,23 @@ def test_a_killed_run_goes_on_where_it_was_and_gives_the_same(done: Done, filmed
     assert torch.equal(done.tracked.reading.landmarks, torch.stack(whole))
 
 
-def test_what_is_up_to_date_is_kept(done: Done, filmed: Filmed, tmp_path: Path) -> None:
-    out = tmp_path / "out"
+def test_what_is_up_to_date_is_kept(
+    done: Done, filmed: Filmed, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    out, decoded, color_frames = tmp_path / "out", [], VideoFile.color_frames
     shutil.copytree(done.out, out)
+
+    def counted(clip: VideoFile) -> Iterator[torch.Tensor]:
+        for frame in color_frames(clip):
+            decoded.append(frame)
+            yield frame
+
+    monkeypatch.setattr(VideoFile, "color_frames", counted)
     made = {path: path.stat().st_mtime_ns for path in (out / "overlay.mp4", out / FOLDER / "solution.safetensors")}
     again = track_video(filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera))
     assert {path: path.stat().st_mtime_ns for path in made} == made
     assert set(again.seconds) == {"smoothing"}
+    assert len(decoded) == 1  # the first frame says how many faces there are
     torch.testing.assert_close(again.solution.weights, done.tracked.solution.weights)
     smooth = track_video(
         filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera, overlay="none", whole_take=True)

@@ -71,6 +71,8 @@ def _track(
     for first in frames:
         if at == 0:
             faces = len(find_faces(first, tracker.detector))
+            if done >= clip.count:  # a run before has read all of them
+                break
         piece = chain([first], islice(frames, PIECE - 1))  # one by one: 64 frames in 4K take half a gigabyte
         if at < done:
             at += sum(1 for _ in piece)
