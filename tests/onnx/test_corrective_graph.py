@@ -89,6 +89,18 @@ def test_the_frames_that_a_graph_is_checked_with_show_one_that_stops_too_early(
     assert (found - alike(markers)).abs().max() > 0.05
 
 
+def test_a_few_of_all_shapes_of_a_face_are_solved_from_cold() -> None:
+    face, generator = performer(texture=False), torch.Generator().manual_seed(0)
+    rig = BlendshapeRig(face.neutral, face.deltas, face.names, planted_correctives(face, 20))
+    solver = MarkerSolver(rig, Attachment.from_vertices(rig.neutral, rig.neutral.landmarks[17:]))
+    weights = torch.rand(100, len(rig.names), generator=generator).square()
+    weights *= torch.rand(weights.shape, generator=generator) < 0.2
+    markers = solver.points(weights).float()
+    markers += 0.3 * torch.randn(markers.shape, generator=generator)
+    found = CorrectiveGraph(solver)(markers, torch.zeros_like(weights))
+    torch.testing.assert_close(found, solver(markers), atol=0.01, rtol=0)
+
+
 def test_the_other_graph_is_refused(solver: MarkerSolver) -> None:
     with pytest.raises(ValueRangeError, match="found a rig with correctives"):
         SolverGraph(solver)

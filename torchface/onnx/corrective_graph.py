@@ -15,7 +15,7 @@ from torchface.optim.fixed_splitting import FixedSplitting, fixed_loop
 
 STEPS = 6
 _ROUNDED_STEPS, _LINEAR_SPLITTING, _SPLITTING = 2, 60, 60
-_RHO, _LENGTHS = 0.04, (1.0, 0.5, 0.15)  # shapes that move markers nearly alike need a small rho
+_RHO, _LENGTHS = 0.06, (1.0, 0.5, 0.15)  # shapes that move markers nearly alike need a small rho, others a large one
 
 
 class CorrectiveGraph(nn.Module):
