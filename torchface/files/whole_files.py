@@ -1,6 +1,7 @@
 """Whole files in and out: refused before they fill the memory, replaced only when they are complete."""
 
 import errno
+import itertools
 import os
 import re
 import shutil
@@ -157,6 +158,12 @@ def make_folder(folder: str | Path) -> Path:
     except (OSError, ValueError) as error:
         raise unmade(folder, error) from error
     return folder
+
+
+def unused(path: Path) -> Path:
+    """The path where nothing is there, else the first free one of ``NAME_2``, ``NAME_3`` and so on."""
+    others = (path.with_stem(f"{path.stem}_{number}") for number in itertools.count(2))
+    return next(one for one in itertools.chain([path], others) if not one.exists())
 
 
 def check_ending(path: str | Path, *endings: str, hint: str = "") -> None:

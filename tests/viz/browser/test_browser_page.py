@@ -137,11 +137,17 @@ def test_what_was_not_saved_is_kept_when_the_page_is_closed(
     viewer = RigViewer(ball_rig, out=tmp_path / "edited.csv", port=0)
     viewer.set_weight("jawOpen", 0.75)
     assert closed(viewer) == [tmp_path / "edited_unsaved.csv"]
-    kept = [load_take(tmp_path / f"edited{end}.csv").weights.values[0, :, 0] for end in ("", "_unsaved")]
-    assert [float(row[ball_rig.names.index("jawOpen")]) for row in kept] == [0.5, 0.75]
+    viewer = RigViewer(ball_rig, out=tmp_path / "edited.csv", port=0)
+    viewer.set_weight("jawOpen", 0.25)
+    assert closed(viewer) == [tmp_path / "edited_unsaved_2.csv"]
+    ends = ("", "_unsaved", "_unsaved_2")
+    kept = [load_take(tmp_path / f"edited{end}.csv").weights.values[0, :, 0] for end in ends]
+    assert [float(row[ball_rig.names.index("jawOpen")]) for row in kept] == [0.5, 0.75, 0.25]
     picker, again = (Picker(ball_rig, None, tmp_path / "picks", custom_set(["ear", "chin"]), port=0) for _ in "ab")
     picker.session.pick_landmark(SurfacePoint(0, (1.0, 0.0, 0.0), (0.0, 0.0, 0.0), 0))
     assert closed(picker) == [tmp_path / "picks" / "unsaved" / "landmarks.json"]
+    picker.session.pick_landmark(SurfacePoint(0, (0.0, 1.0, 0.0), (0.0, 0.0, 0.0), 1))
+    assert {path.parent for path in closed(picker)} == {tmp_path / "picks" / "unsaved_2"}
     again.session.resume(tmp_path / "picks" / "unsaved")
     again.save()
     assert again.session.picks.landmarks == (0, None)
@@ -150,8 +156,10 @@ def test_what_was_not_saved_is_kept_when_the_page_is_closed(
     session = AnnotationSession([frame, replace(frame, name="two")], tmp_path / "frames")
     session.grab(30)
     session.drag(torch.tensor([50.0, 11.0]))
-    points = tmp_path / "frames" / "unsaved" / "one.pts"
+    points, later = (tmp_path / "frames" / folder / "one.pts" for folder in ("unsaved", "unsaved_2"))
     assert closed(LandmarkEditor(session, port=0)) == [points]
+    session.drag(torch.tensor([40.0, 11.0]))
+    assert closed(LandmarkEditor(session, port=0)) == [later]
     assert load_landmark_points(points).points[30].tolist() == [50.0, 11.0]
 
 

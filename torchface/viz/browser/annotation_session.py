@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ShapeError, ValueRangeError
+from torchface.files.whole_files import unused
 from torchface.landmarks.images.appearance.annotated_frames import AnnotatedFrame, save_annotated_frame
 
 
@@ -107,7 +108,7 @@ class AnnotationSession:
         """Writes the frames that changed since they were saved into the folder's ``unsaved``."""
         rows = zip(self.frames, self._history, self._written, strict=True)
         changed = [(frame, steps[-1]) for frame, steps, written in rows if not torch.equal(steps[-1], written)]
-        kept = self.folder / "unsaved"
+        kept = unused(self.folder / "unsaved")
         return [save_annotated_frame(replace(frame, landmarks=points), kept) for frame, points in changed]
 
     def advance(self) -> bool:

@@ -83,7 +83,7 @@ class BrowserPage:
             self.server.stop()
 
     def keep_unsaved(self) -> list[Path]:
-        """Writes what was changed since the last Save under another name than Save does, and returns the files."""
+        """Writes what was changed since the last Save under a name that no file has, and returns the files."""
         return []
 
     def wait(self) -> None:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import TopologyError, TorchfaceError, ValueRangeError
-from torchface.files.whole_files import all_or_none, made_folder
+from torchface.files.whole_files import all_or_none, made_folder, unused
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.io import save_correspondences, save_landmarks, save_mesh, save_rig
 from torchface.mesh import Annotations, Mesh
@@ -103,7 +103,7 @@ class Picker(BrowserPage):
         picks = replace(self.session.picks, waiting=None)
         if picks in (replace(self._saved, waiting=None), Picks((None,) * len(picks.landmarks))):
             return []
-        return save_picks(self.session, self.out / "unsaved", self.rig)
+        return save_picks(self.session, unused(self.out / "unsaved"), self.rig)
 
     def _nearest(self, origin: Tensor, direction: Tensor) -> tuple[SurfacePoint | None, bool]:
         """The first surface in the ray's way, and whether it is the scan's."""

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import ValueRangeError
-from torchface.files.whole_files import make_folder
+from torchface.files.whole_files import make_folder, unused
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import save_take
 from torchface.rig import BlendshapeRig
@@ -93,7 +93,7 @@ class RigViewer(BrowserPage):
         """Writes the weights beside the file, as ``NAME_unsaved.csv``, if they changed since the last save."""
         if torch.equal(self.editor.weights, self._saved):
             return []
-        return [self._write(self.out.with_name(f"{self.out.stem}_unsaved.csv"))]
+        return [self._write(unused(self.out.with_name(f"{self.out.stem}_unsaved.csv")))]
 
     def _write(self, path: Path) -> Path:
         make_folder(path.parent)
