@@ -404,10 +404,10 @@ def test_the_app_takes_a_mapping_and_does_not_count_the_tongue(tmp_path: Path, m
         (tmp_path / "page" / name).write_text("page")
     monkeypatch.setattr(app_folder, "built_page", lambda progress: tmp_path / "page")
     write_planted_graph(tmp_path / "planted.onnx")
-    path = sheet(tmp_path / "sheet.glb", ("jawOpen", "Tongue_Out", "antenna"))
+    path = sheet(tmp_path / "sheet.glb", ("jawOpen", "Tongue_Out", "antenna", "jawOpen_tongueOut"))
     report = app_folder.export_app(tmp_path / "app", path, tmp_path / "planted.onnx")
-    assert (report.driven, report.still) == (("jawOpen",), ("Tongue_Out", "antenna"))
-    assert ("shapes that a face moves", "1 of 3") in report.rows()
+    assert (report.driven, report.still) == (("jawOpen",), ("Tongue_Out", "antenna", "jawOpen_tongueOut"))
+    assert ("shapes that a face moves", "1 of 4") in report.rows()
     (tmp_path / "names.toml").write_text("[Maw]\nsum = {jawOpen = 0.5}\n[Tip]\nsum = {tongueOut = 1}\n")
     own = sheet(tmp_path / "own.glb", ("Maw", "Tip"))
     with pytest.raises(NameMismatchError, match="or --mapping FILE"):

@@ -105,7 +105,11 @@ def export_app(
                 delete_file(out / former)
     packed = {name: len(gzip.compress(data, 6)) for name, data in files.items()}
     sources = zip(shown.names, shown.shapes.matrix, shown.shapes.products, strict=True)
-    moved = {name for name, sums, product in sources if {*sums.nonzero()[:, 0].tolist(), *product} - {_TONGUE}}
+    moved = {
+        name
+        for name, sums, product in sources
+        if _TONGUE not in product and {*sums.nonzero()[:, 0].tolist(), *product} - {_TONGUE}
+    }
     driven = tuple(name for name in shown.names if name in moved.difference(shown.still))
     still = tuple(name for name in shown.names if name not in driven)
     return AppReport({name: len(data) for name, data in files.items()}, packed, driven, still)
