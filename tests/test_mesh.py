@@ -76,6 +76,16 @@ def test_fingerprint_is_of_the_topology_alone() -> None:
     assert Mesh(mesh.vertices, mesh.faces.flip(0)).fingerprint() != mesh.fingerprint()
 
 
+def test_a_mesh_of_another_topology_is_described() -> None:
+    mesh = grid()
+    mesh.require_topology(mesh.with_vertices(2 * mesh.vertices), "a", "b")
+    loose = Mesh(torch.cat([mesh.vertices, mesh.vertices[:1]]), mesh.faces)
+    with pytest.raises(TopologyError, match=r"a: found 13 vertices and 11 .* b, 12 vertices and 11 triangles,"):
+        loose.require_topology(mesh, "a", "b")
+    with pytest.raises(TopologyError, match="expected those of b, 12 vertices and other triangles, in their order"):
+        Mesh(mesh.vertices, mesh.faces.flip(0)).require_topology(mesh, "a", "b")
+
+
 def test_broken_meshes_are_refused_with_what_was_found() -> None:
     mesh = grid()
     with pytest.raises(TopologyError, match="found indices 0 to 12, expected 0 to 11"):

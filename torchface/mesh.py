@@ -215,10 +215,11 @@ class Mesh:
         """Raises ``TopologyError`` where this mesh, of a source, has not the vertices and triangles of another one."""
         if len(self.vertices) == len(other.vertices) and torch.equal(self.faces, other.faces.to(self.faces)):
             return
-        same = "other triangles" if self.faces.shape == other.faces.shape else f"{len(other.faces)} triangles"
+        counts = len(other.vertices), len(other.faces)
+        same = "other triangles" if counts == (len(self.vertices), len(self.faces)) else f"{counts[1]} triangles"
         raise TopologyError(
             f"{source}: found {len(self.vertices)} vertices and {len(self.faces)} triangles, expected those of "
-            f"{owner}, {len(other.vertices)} vertices and {same}, in their order{hint}"
+            f"{owner}, {counts[0]} vertices and {same}, in their order{hint}"
         )
 
     def fingerprint(self) -> str:
