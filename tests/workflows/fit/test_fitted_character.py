@@ -87,6 +87,9 @@ def test_teeth_are_as_bright_as_photographed_and_grey_in_black_and_white(colors:
     shown = made.texture[:, ((1 - at[:, 1]) * size).long(), (at[:, 0] * size).long()]
     assert abs(float(shown.mean()) - 0.5) < 0.06
     assert bool((made.texture == made.texture[:1]).all()) != colors
+    assert "hair" not in made.regions
+    covered = dressed_rig(actor, actor, photographed, [image], parts, torch.zeros(1, 68, 2), True, True).rig.neutral
+    assert "hair" in covered.regions
 
 
 @pytest.mark.parametrize("scale", [0.85, 1.0])

@@ -1,5 +1,6 @@
 """What makes a photograph unfit for a likeness is said with its figure; what is hardly a face is refused."""
 
+import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,8 +27,10 @@ from torchface.workflows.fit.picture_checks import (
     cover_lines,
     edge_lines,
     forehead_lines,
+    hat_lines,
     light_lines,
     picture_lines,
+    without_hat,
 )
 from torchface.workflows.named_finders import part_finder
 
@@ -186,6 +189,36 @@ def test_a_forehead_that_the_pictures_edge_cuts_is_remarked_on_whatever_the_tilt
     for points in (cut, cut.flip(1), 99 - cut):
         (line,) = forehead_lines(Path("a.png"), (100, 100), points)
         assert "a.png: the picture's edge cuts off the forehead" in line
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.6])
+def test_a_hat_is_remarked_on_and_is_no_hair_whatever_the_tilt_and_a_fringe_is_hair(turn: float) -> None:
+    """Over eyes 40 pixels apart: a hat's edge, locks that end 4 pixels apart, and hair 20 pixels over the brows."""
+    y, x = torch.meshgrid(*(torch.arange(160, dtype=torch.float64) - 80,) * 2, indexing="ij")
+    around = torch.tensor([[math.cos(turn), math.sin(turn)], [-math.sin(turn), math.cos(turn)]]).double()
+    marks = torch.zeros(68, 2).double()
+    marks[17:27, 1] = -12.0
+    marks[[36, 45], 0] = torch.tensor([-20.0, 20.0]).double()
+
+    def parts(name: str, ends: Tensor) -> FaceParts:
+        number = torch.where(y < ends, PARTS.index(name), PARTS.index("skin"))
+        shares = torch.nn.functional.one_hot(number, len(PARTS)).permute(2, 0, 1).float()
+        return FaceParts(shares, torch.cat([around.T, torch.full((2, 1), 80.0).double()], 1))
+
+    def lines(name: str, ends: Tensor) -> list[str]:
+        return hat_lines(Path("a.png"), parts(name, ends), marks @ around.T)
+
+    straight, locks = torch.full_like(x, -16.0), -16 + 4 * (x % 8 < 4)
+    (cloth,), (dark,) = lines("cloth", straight - 3), lines("hair", straight)
+    assert "a.png: a hat or a hand hides the forehead (cloth or hand" in cloth
+    assert "straight edge over the brows: a hat" in dark
+    assert lines("hair", locks) == lines("hair", straight - 16) == []
+    bare = without_hat(parts("hair", straight), marks @ around.T)
+    assert float(bare.of("hair").sum()) == 0
+    assert torch.equal(bare.of("skin"), parts("hair", straight).of("skin"))
+    unknown = marks.clone()
+    unknown[17:27] = torch.nan
+    assert hat_lines(Path("a.png"), parts("hair", straight), unknown) == []
 
 
 def test_landmarks_that_no_head_has_are_remarked_on() -> None:

@@ -45,11 +45,13 @@ def dressed_rig(
     parts: Sequence[FaceParts],
     marks: Tensor,
     whole: bool,
+    hats: bool = False,
 ) -> DressedRig:
     """A fitted rig with the skin of its photographs; ``template`` has the parts that nobody sees in them.
 
     A ``whole`` one is a character with teeth, tongue, lashes, hair and collar, for rigs of the performer's topology;
-    the photographs' brows are its only ones.
+    the photographs' brows are its only ones. Its hair is as usual where they show ``hats`` alone, else where no hair is
+    seen it is bald.
     """
     # Photographs show little of eyeballs and teeth: parts of their own keep the template's skin.
     unseen = hidden_parts(template.neutral, torch.zeros(len(template.vertices), dtype=torch.bool))
@@ -61,7 +63,7 @@ def dressed_rig(
     look = Look(
         hair=usual.hair if fit.hair is None else _color(fit.hair),
         iris=usual.iris if fit.iris is None else _color(fit.iris),
-        haircut=None if fit.hair is None else "long" if hangs_down(parts, marks) else "short",
+        haircut=None if fit.hair is None and not hats else "long" if hangs_down(parts, marks) else "short",
         fringe=fit.fringe,
         shirt=usual.shirt if shirt is None else _color(shirt),
         iris_size=iris_size(neutral),

@@ -54,8 +54,10 @@ from torchface.workflows.fit.picture_checks import (
     edge_lines,
     forehead_lines,
     grey_lines,
+    hat_lines,
     light_lines,
     picture_lines,
+    without_hat,
 )
 from torchface.workflows.fit.sharpness_checks import sharpness_lines
 from torchface.workflows.fit.video_pictures import video_pictures
@@ -113,6 +115,7 @@ class FittedHead:
     stray: bool = False  # whether given landmarks are not on a face
     dark: bool = False  # whether one of them is too dark to show the skin's colour
     focal_given: bool = False
+    hats: bool = False  # whether all of them show a covered forehead
 
     def verdict(self) -> str:
         """Whether the head is to be used, in a line; no landmark says whether skin and likeness are right."""
@@ -164,6 +167,8 @@ class FittedHead:
             worn = "hair" in self.rig.neutral.regions
             what = f"the template's {cut}, not the person's" if worn else "painted on the head as a cap"
             lines.append(f"hair: {_code(fit.hair)}, its {seen}; {what}")
+        elif self.hats:
+            lines.append("hair: covered; the template's haircut and colour")
         elif fit.mesh.texture is not None:
             lines.append("hair: none seen over the brows: bald, covered, or grey, which the network may miss")
         if fit.iris is not None:
@@ -225,8 +230,10 @@ def fit_photographs(
 
     progress("finding skin, hair and what covers them")
     parts = [part_finder()((255 * image[:3].clamp(0, 1)).byte(), one) for image, one in zip(images, marks, strict=True)]
+    hats = [hat_lines(*one) for one in zip(photographs, parts, marks, strict=True)]
+    hatless = [without_hat(one, at) if hat else one for one, at, hat in zip(parts, marks, hats, strict=True)]
     fitting = replace(settings.fit, expression_prior=prior, annotated=bool(found))
-    fitting = fitting if settings.everything else replace(fitting, parts=parts)
+    fitting = fitting if settings.everything else replace(fitting, parts=hatless)
     # A template that the user names is written as it is.
     worn = settings.template is None and not settings.everything and bool(fitting.texture_size) and is_performers(rig)
     fitting = replace(fitting, paint_hair=not worn)
@@ -245,10 +252,11 @@ def fit_photographs(
         if not settings.everything:
             of_light, too_dark = light_lines(photograph, image, shown, points)
             remarks, dark = remarks + of_light, dark or too_dark
+    remarks += [line for lines in hats for line in lines]
     remarks += sharpness_lines(photographs, images, marks) if found else []
     alone = [bare(marks[i : i + 1], [i]) for i in range(len(marks))]
     remarks += width_lines(photographs, alone, heads, rig.neutral.landmarks)
-    colors = torch.stack([part_colors(*one) for one in zip(images, parts, strict=True)])
+    colors = torch.stack([part_colors(*one) for one in zip(images, hatless, strict=True)])
     # Nobody can leave out a frame of a film.
     remarks += one_person_lines(photographs, marks, alone, bare, insist or one_film, colors)
     fit = fit_images(heads, rig, marks, sizes, images, settings.focal, fitting, progress)
@@ -259,7 +267,7 @@ def fit_photographs(
         of_landmarks, stray = landmark_lines(photographs, images, marks, settings.landmark_model, bare)
         remarks += of_landmarks
     transferred = transfer_with_report(rig, fit.mesh, progress=progress)
-    dressed = dressed_rig(transferred.rig, rig, fit, images, parts, marks, worn)
+    dressed = dressed_rig(transferred.rig, rig, fit, images, hatless, marks, worn, all(hats))
     made = dressed.rig
     progress("writing the rig and the overlays")
     overlays = tuple(out.with_name(f"{out.stem}_{i + 1}_{path.stem}.png") for i, path in enumerate(photographs))
@@ -286,6 +294,7 @@ def fit_photographs(
         stray,
         dark,
         settings.focal is not None,
+        worn and all(hats),
     )
 
 
