@@ -16,6 +16,7 @@ IRIS_WIDTH = 11.7
 """Of people's irises, millimetres."""
 
 _MIN_RADIUS, _MIN_RING, _RING = 2.5, 6, (0.45, 0.8)  # pixels, pixels, radii
+_SHIFTS = (0.0, -0.4, 0.4, -0.8, 0.8)  # radii from midway between the lids, where irises of unknown place may be
 _DARKEST, _LARGE = 0.07, 0.4  # of the largest iris' radius: in which photographs colours count
 _PURPLE = 0.9  # of the lesser of red and blue: what green an iris has at least
 _WHITE = 0.72  # mean of the channels from which an eyeball's texel is no iris
@@ -31,7 +32,7 @@ def iris_color(
 
     Args:
         posed: the head as the photographs show it, or as each of them does, with the 68 landmarks.
-        irises: centres in each photograph, (I,2,2) pixels; midway between the lids if absent.
+        irises: centres in each photograph, (I,2,2) pixels; where it is darkest between the lids if absent.
     """
     found, radii = list[Tensor](), list[float]()
     meshes = [posed] * len(images) if isinstance(posed, Mesh) else posed
@@ -42,12 +43,14 @@ def iris_color(
         if radius < _MIN_RADIUS:
             continue
         eyes = camera.project(marks).view(2, 6, 2)
-        centres = eyes.mean(1) if irises is None else irises[number].double()
-        rings = [
-            _ring(image.cpu(), centre, lids, radius)
-            for centre, lids in zip(centres, eyes, strict=True)
-            if bool(torch.isfinite(centre).all())
-        ]
+        if irises is None:
+            rings = [_darkest_ring(image.cpu(), lids, radius) for lids in eyes]
+        else:
+            rings = [
+                _ring(image.cpu(), centre, lids, radius)
+                for centre, lids in zip(irises[number].double(), eyes, strict=True)
+                if bool(torch.isfinite(centre).all())
+            ]
         colors = torch.cat(rings) if rings else torch.zeros(0, 3)
         if len(colors) < _MIN_RING:
             continue
@@ -60,6 +63,13 @@ def iris_color(
             radii.append(radius)
     large = [color for color, radius in zip(found, radii, strict=True) if radius >= _LARGE * max(radii)]
     return torch.stack(large).quantile(0.5, dim=0) if large else None
+
+
+def _darkest_ring(image: Tensor, lids: Tensor, radius: float) -> Tensor:
+    """The ring (Q,3) that is darkest of those about places between lids (6,2), as people do not look ahead at times."""
+    way = radius * torch.nn.functional.normalize(lids[3] - lids[0], dim=0)
+    rings = [_ring(image, lids.mean(0) + shift * way, lids, radius) for shift in _SHIFTS]
+    return min(rings, key=lambda ring: float(ring.mean()) if 2 * len(ring) >= _MIN_RING else math.inf)
 
 
 def _ring(image: Tensor, centre: Tensor, lids: Tensor, radius: float) -> Tensor:
