@@ -15,6 +15,7 @@ from torchface.errors import ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.synthetic.stages import StageFlaws, place_markers, record
 from torchface.workflows.marker_input import scale_warnings
+from torchface.workflows.solve.solution import _frames
 from torchface.workflows.solve.take_check import check_coverage
 
 Solve = Callable[..., str]
@@ -201,6 +202,13 @@ def test_frames_that_show_too_few_markers_are_counted(stage: Path) -> None:
     values[10:17, 0] = 0
     poor = Take(60.0, markers=Track(take.markers.names, values))
     assert check_coverage(Attachment.load(stage / "attachment.json"), poor, 4).poor == 7
+
+
+def test_of_many_stretches_of_frames_the_first_are_named_and_the_others_counted() -> None:
+    rows = torch.tensor([10 * stretch + frame for stretch in range(10) for frame in range(3)])
+    said = _frames(Take(60.0, markers=Track(("a",), torch.zeros(100, 1, 3))), rows)
+    assert said.startswith("30 frames (0–2, 10–12, ")
+    assert said.endswith("70–72 and 2 more stretches)")
 
 
 @pytest.mark.parametrize("more", [(), ("--frame-by-frame",), ("--frame-by-frame", "--slip", "--clean")])

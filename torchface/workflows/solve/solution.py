@@ -287,4 +287,5 @@ def _frames(take: Take, rows: Tensor) -> str:
     breaks = (rows.diff() > 1).nonzero()[:, 0].tolist()
     firsts, lasts = [0, *(i + 1 for i in breaks)], [*breaks, len(rows) - 1]
     spans = [(int(rows[a]), int(rows[b])) for a, b in zip(firsts, lasts, strict=True)]
-    return f"{len(rows)} frames ({listed(str(a) if a == b else f'{a}–{b}' for a, b in spans)})"
+    shown = listed(str(a) if a == b else f"{a}–{b}" for a, b in spans)
+    return f"{len(rows)} frames ({shown}{' stretches' if shown.endswith('more') else ''})"
