@@ -206,6 +206,15 @@ def test_like_heads_with_other_hair_and_lips_are_warned_of_and_not_refused() -> 
     assert "with the colours of hair, brows and lips a.png" in line
 
 
+def test_many_pictures_with_the_errors_of_one_are_hardly_surer_of_the_head_than_it() -> None:
+    """Independent errors would make them as sure as 40 are, alike ones at most as the inverse of their share."""
+    eye, off = torch.eye(3), torch.tensor([0.6, -0.6, 0.6])
+    one, odd = (SimpleNamespace(coefficients=at, covariance=0.1 * eye) for at in (0 * off, off))
+    pair, crowd = fit_checks.same_person([odd, one]), fit_checks.same_person([odd, *[one] * 40])
+    surer = SimpleNamespace(coefficients=0 * off, covariance=eye / (1 + 9 / 0.3))  # 9 is what 0.1 says beyond the prior
+    assert fit_checks.same_person([odd, surer])[0] < crowd[0] < pair[0]
+
+
 def test_a_photograph_that_form_and_colours_call_another_persons_is_refused_beside_a_less_likely_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

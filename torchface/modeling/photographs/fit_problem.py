@@ -19,7 +19,7 @@ _STATED_68, _STATED_POINTS = 1.2, 0.75
 # By twelve films: how much of these errors is alike in all pictures of one person, whom pictures then show once and not
 # each anew; and how much further landmarks of brows lie from a head's, for hair grows where it will. Lips whose edge is
 # missed are seen at once: points of the skin around them move it by 0.9 % of the mouth's width if it counts no more.
-_ALIKE_IN_PICTURES, _BROWS_GROW, _LIPS_HOLD = 0.3, 3.0, 0.5
+ALIKE_IN_PICTURES, _BROWS_GROW, _LIPS_HOLD = 0.3, 3.0, 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +72,7 @@ class Problem:
     def identity_precision(self) -> float:
         """Of the prior on a coefficient of identity, which has a deviation of 1, beside errors that are taken to be
         independent in each picture."""
-        return 1.0 if self.settings.surface is None else 1.0 + _ALIKE_IN_PICTURES * (len(self.found) - 1)
+        return 1.0 if self.settings.surface is None else 1.0 + ALIKE_IN_PICTURES * (len(self.found) - 1)
 
     @property
     def expressions(self) -> int:

@@ -9,6 +9,7 @@ from torch import Tensor
 from torchface.errors import AlignmentError
 from torchface.landmarks import NoFaceError
 from torchface.modeling import FitSettings, HeadModel, ImageFit
+from torchface.modeling.photographs.fit_problem import ALIKE_IN_PICTURES
 from torchface.modeling.photographs.landmark_view import JAW
 from torchface.workflows.fit.color_evidence import color_evidence
 from torchface.workflows.fit.fit_landmarks import PhotographLandmarks, find_in_photographs
@@ -191,7 +192,8 @@ def same_person(fits: Sequence[ImageFit]) -> Tensor:
 
     .. math:: \log \frac{p(q_i, q_{\ne i} \mid \text{one } a)}{p(q_i)\, p(q_{\ne i})}, \qquad a \sim N(0, I)
 
-    with landmarks :math:`q` taken to be Gaussian about each fit's coefficients :math:`a`; 0 is no evidence.
+    with landmarks :math:`q` taken to be Gaussian about each fit's coefficients :math:`a`; 0 is no evidence. Errors that
+    the others share, such as of a smile in all of them, are not known the better the more they are.
 
     Args:
         fits: one a photograph, each fitted alone with the same model, I of them.
@@ -210,10 +212,11 @@ def same_person(fits: Sequence[ImageFit]) -> Tensor:
         precisions.append((vectors * values.clamp(min=0)) @ vectors.T)
         pulls.append(posterior @ fit.coefficients.double())
     information, pull = torch.stack(precisions), torch.stack(pulls)
-    together = _log_evidence(information.sum(0), pull.sum(0))
+    alike = 1 + ALIKE_IN_PICTURES * (len(fits) - 2)
+    others, pulled = (information.sum(0) - information) / alike, (pull.sum(0) - pull) / alike
     return torch.stack([
-        together - _log_evidence(one, own) - _log_evidence(information.sum(0) - one, pull.sum(0) - own)
-        for one, own in zip(information, pull, strict=True)
+        _log_evidence(one + more, own + by) - _log_evidence(one, own) - _log_evidence(more, by)
+        for one, own, more, by in zip(information, pull, others, pulled, strict=True)
     ])  # fmt: skip
 
 
