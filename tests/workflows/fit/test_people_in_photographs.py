@@ -215,6 +215,15 @@ def test_many_pictures_with_the_errors_of_one_are_hardly_surer_of_the_head_than_
     assert fit_checks.same_person([odd, surer])[0] < crowd[0] < pair[0]
 
 
+def test_a_line_that_only_frames_and_figures_tell_apart_is_said_once_with_their_count() -> None:
+    of = "WARNING: {}: dark glasses hide {}% of the face"
+    lines = [of.format("f_000001", 14), "note: f_000001: blurred", of.format("f_000009", 9), of.format("a.png", 13)]
+    assert fit_checks.counted(lines, {"f_000001", "f_000009", "f_000011"}) == [
+        "WARNING: 2 of 3 frames, such as f_000001: dark glasses hide 14% of the face", lines[1], lines[3]
+    ]  # fmt: skip
+    assert fit_checks.counted(["WARNING: only profiles"], {"f_000001"}) == ["WARNING: only profiles"]
+
+
 def test_a_photograph_that_form_and_colours_call_another_persons_is_refused_beside_a_less_likely_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

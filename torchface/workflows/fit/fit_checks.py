@@ -1,6 +1,7 @@
 """Checks of a fit: landmarks that do not fit, photographs that do not show one person."""
 
-from collections.abc import Callable, Sequence
+import re
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 
 import torch
@@ -218,6 +219,20 @@ def same_person(fits: Sequence[ImageFit]) -> Tensor:
         _log_evidence(one + more, own + by) - _log_evidence(one, own) - _log_evidence(more, by)
         for one, own, more, by in zip(information, pull, others, pulled, strict=True)
     ])  # fmt: skip
+
+
+def counted(remarks: Sequence[str], frames: Collection[str]) -> list[str]:
+    """Remarks of which those that differ in figures and the frame of a film alone are one, with their count."""
+    alike = dict[str, list[str]]()
+    for line in remarks:
+        kind, _, rest = line.partition(": ")
+        name, _, words = rest.partition(": ")
+        same = re.sub(r"[\d.]+", "", kind + words) if name in frames else line
+        alike.setdefault(same, []).append(line)
+    return [
+        lines[0] if len(lines) == 1 else lines[0].replace(": ", f": {len(lines)} of {len(frames)} frames, such as ", 1)
+        for lines in alike.values()
+    ]
 
 
 def _log_evidence(precision: Tensor, pull: Tensor) -> Tensor:

@@ -31,6 +31,7 @@ from torchface.viz.figures.landmark_dots import with_dots
 from torchface.workflows.fit.color_evidence import part_colors
 from torchface.workflows.fit.fit_checks import (
     ALONE,
+    counted,
     eyes_distances,
     landmark_lines,
     one_person_lines,
@@ -209,7 +210,7 @@ def fit_photographs(
     heads, rig = matching(load_head_model(named.name), settings.template, settings.part)
     prior = load_priors(rig, settings.prior, None).shapes
     progress("reading the photographs")
-    found, one_film = list[PhotographLandmarks](), False
+    found, one_film, given = list[PhotographLandmarks](), False, {path.name for path in photographs}
     if landmarks or not photographs:
         images = [load_image(path) for path in photographs]
         marks = torch.stack(landmarks_of(photographs, landmarks, settings.face))
@@ -287,7 +288,7 @@ def fit_photographs(
         overlays,
         summary,
         tuple(found),
-        tuple(remarks),
+        tuple(counted(remarks, {path.name for path in photographs} - given)),
         named.line,
         tuple(photographs),
         without_colors(images),
