@@ -253,7 +253,6 @@ def fit_photographs(
         if not settings.everything:
             of_light, too_dark = light_lines(photograph, image, shown, points)
             remarks, dark = remarks + of_light, dark or too_dark
-    remarks += [line for lines in hats for line in lines]
     remarks += sharpness_lines(photographs, images, marks) if found else []
     alone = [bare(marks[i : i + 1], [i]) for i in range(len(marks))]
     remarks += width_lines(photographs, alone, heads, rig.neutral.landmarks)
@@ -267,6 +266,8 @@ def fit_photographs(
     else:
         of_landmarks, stray = landmark_lines(photographs, images, marks, settings.landmark_model, bare)
         remarks += of_landmarks
+    if not stray:  # landmarks beside a face have no forehead
+        remarks += [line for lines in hats for line in lines]
     transferred = transfer_with_report(rig, fit.mesh, progress=progress)
     dressed = dressed_rig(transferred.rig, rig, fit, images, hatless, marks, worn, all(hats))
     made = dressed.rig
