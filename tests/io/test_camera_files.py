@@ -1,6 +1,7 @@
 """Calibrations come back from their files; broken files are refused by name."""
 
 import contextlib
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,13 +19,14 @@ def camera() -> CameraCalibration:
     return CameraCalibration(K, torch.tensor([-0.28, 0.09, 1e-7, -0.0007, -0.01]).double(), 1280, 720, 0.173)
 
 
-@pytest.mark.parametrize("kept", [camera(), assumed_calibration(640, 480)], ids=["measured", "assumed"])
+@pytest.mark.parametrize("kept", [camera(), assumed_calibration(640, 480), replace(camera(), guessed=True)])
 def test_there_and_back(kept: CameraCalibration, tmp_path: Path) -> None:
     save_calibration(kept, tmp_path / "camera.toml")
     found = load_calibration(tmp_path / "camera.toml")
     assert torch.equal(found.intrinsics, kept.intrinsics)
     assert torch.equal(found.distortion, kept.distortion)
     assert (found.width, found.height, found.error) == (kept.width, kept.height, kept.error)
+    assert (found.guessed, "guessed" in (tmp_path / "camera.toml").read_text()) == (kept.guessed,) * 2
     assert [path.name for path in tmp_path.iterdir()] == ["camera.toml"]
 
 
@@ -43,6 +45,7 @@ def test_there_and_back(kept: CameraCalibration, tmp_path: Path) -> None:
         ("651.5,", "651.5, 3.0,", "center = .*expected two numbers"),
         ("k3 =", "k4 =", "distortion.k4 = .*expected only k1, k2, p1, p2, k3"),
         ("skew =", 'model = "fisheye"\nskew =', "model = 'fisheye', expected only format, width, height, focal"),
+        ("skew =", "guessed = 1\nskew =", "guessed = 1, expected true or false"),
         ("[distortion]", "[distorsion]", "distorsion = .*expected only"),
         ("torchface.camera/1", "torchface.camera/2", "found format 'torchface.camera/2'"),
         ("[distortion]", "[distortion", "not TOML"),

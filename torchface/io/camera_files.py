@@ -14,7 +14,7 @@ _MAX_BYTES = 2**16
 _MAX_SIDE = 2**16  # pixels
 _MAX_CAMERAS = 16
 _COEFFICIENTS = ("k1", "k2", "p1", "p2", "k3")
-_FIELDS = ("format", "width", "height", "focal", "skew", "center", "distortion", "error")
+_FIELDS = ("format", "width", "height", "focal", "skew", "center", "distortion", "error", "guessed")
 _PLACE = ("name", "offset", "rotation", "translation")
 
 
@@ -92,6 +92,7 @@ def _fields(calibration: CameraCalibration) -> dict[str, object]:
         "center": [K[0][2], K[1][2]],
         "distortion": dict(zip(_COEFFICIENTS, calibration.distortion.tolist(), strict=True)),
         "error": calibration.error,
+        "guessed": calibration.guessed or None,
     }
 
 
@@ -116,10 +117,14 @@ def _calibration(document: Value, path: str | Path) -> CameraCalibration:
     skew, error = document["skew"].number() if document["skew"] else 0.0, document["error"]
     table = document["distortion"].table(*_COEFFICIENTS) if document["distortion"] else {}
     distortion = [table[name].number() if name in table else 0.0 for name in _COEFFICIENTS]
-    measured = error.number() if error else None
+    measured, guessed = error.number() if error else None, document["guessed"]
+    if not isinstance(guessed.found, bool | None):
+        raise guessed.error("true or false")
     document.table(*_FIELDS, *_PLACE)  # a model of another lens, or a name that is misspelt, would count for nothing
     intrinsics = torch.tensor([[focal[0], skew, center[0]], [0, focal[1], center[1]], [0, 0, 1]], dtype=torch.float64)
     try:
-        return CameraCalibration(intrinsics, torch.tensor(distortion, dtype=torch.float64), width, height, measured)
+        return CameraCalibration(
+            intrinsics, torch.tensor(distortion, dtype=torch.float64), width, height, measured, bool(guessed.found)
+        )
     except TorchfaceError as wrong:
         raise FileFormatError(f"{path}: {wrong}") from wrong

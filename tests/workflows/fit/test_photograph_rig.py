@@ -92,7 +92,7 @@ def test_the_command_makes_the_actors_rig(
         assert float(drawn / seen) == pytest.approx(1, abs=0.15)
         camera = load_calibration(tmp_path / f"rig_{i + 1}_p{i}.toml")
         assert (camera.width, camera.height) == load_image(studio / f"p{i}.png").shape[:0:-1]
-        assert not camera.assumed
+        assert (camera.assumed, camera.guessed) == (False, True)
 
 
 def test_landmarks_that_no_file_gives_are_found(

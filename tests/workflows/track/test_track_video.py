@@ -169,6 +169,9 @@ def test_a_camera_that_is_given_without_its_error_is_named(done: Done) -> None:
     told = " ".join(replace(done.tracked, inputs=given).lines())
     assert "camera: from camera.toml, of unknown error" in told
     assert "none given" not in told
+    given = replace(inputs, calibration=replace(inputs.calibration, error=1.5, guessed=True))
+    (line,) = (line for line in replace(done.tracked, inputs=given).lines() if line.startswith("camera: "))
+    assert line == "camera: from camera.toml, its focal length a guess by a face, 1.50 px off when it was made"
 
 
 def test_the_verdict_comes_first(done: Done) -> None:

@@ -23,6 +23,7 @@ class CameraCalibration:
         distortion: k1, k2, p1, p2, k3 of radial and tangential distortion, (5,); zeros for a lens without.
         width, height: of the images that it holds for, pixels.
         error: reprojection, root mean square, pixels; None where the camera was not measured but assumed.
+        guessed: whether the focal length was estimated with a head that was not known, and is rough.
 
     Raises:
         ShapeError: intrinsics or distortion of another shape.
@@ -34,6 +35,7 @@ class CameraCalibration:
     width: int
     height: int
     error: float | None = None
+    guessed: bool = False
 
     def __post_init__(self) -> None:
         if self.intrinsics.shape != (3, 3) or self.distortion.shape != (5,):

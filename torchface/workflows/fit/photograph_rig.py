@@ -278,7 +278,8 @@ def fit_photographs(
         for i, (path, image) in enumerate(zip(overlays, images, strict=True)):  # one photograph at a time
             save_rendered_image(overlay(fit, i, image, marks[i], made), path)
         for path, camera, (width, height), error in zip(overlays, fit.cameras, sizes, fit.errors.tolist(), strict=True):
-            calibration = CameraCalibration(camera.intrinsics.double(), torch.zeros(5).double(), width, height, error)
+            lens = camera.intrinsics.double(), torch.zeros(5).double()
+            calibration = CameraCalibration(*lens, width, height, error, settings.focal is None)
             save_calibration(calibration, path.with_suffix(".toml"))
         for path, one in zip(overlays, found, strict=False):  # to be corrected and given as --landmarks
             save_pts(one.face.landmarks, path.with_suffix(".pts"))

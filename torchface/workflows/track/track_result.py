@@ -93,6 +93,7 @@ class Tracked:
         if file is None and error is None:
             return "assumed"
         found = "as given" if file is None else f"from {file.name}"
+        found += ", its focal length a guess by a face" if self.calibration.guessed else ""
         return f"{found}, " + ("of unknown error" if error is None else f"{error:.2f} px off when it was made")
 
     @property
