@@ -55,8 +55,8 @@ _ONE_ANGLE = 20.0
 _GRID = 40
 _FOREHEAD = 0.7  # of the eyes' distance, from between the eyes; 45 faces in photographs and films have 1.3 at least
 # In distances between the eyes' outer corners, from the highest brow: the forehead, and the step, thickness and
-# greatest height of an edge over it. It strays from a parabola by at most 0.010 where 37 painted hats end, by 0.015 at
-# least where 16 fringes do. Share of a forehead: of 45 without a hat at most 0.01 is cloth or hands.
+# greatest height of an edge over it. It strays from a parabola by at most 0.010 where 34 painted hats end, by 0.015 at
+# least where 16 fringes do. Share of a forehead: of 48 without a hat at most 0.01 is cloth or hands.
 _ACROSS, _OVER, _STEP, _THICK, _LOW, _STRAIGHT, _HATLESS = 0.3, (-0.05, 0.45), 0.01, 8, 0.25, 0.0125, 0.05
 _COVERS = {
     "glasses": (0.12, "dark glasses hide"), "hand": (0.06, "a hand hides"), "cloth": (0.10, "cloth (a mask?) hides"),
