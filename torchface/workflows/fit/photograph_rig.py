@@ -231,7 +231,7 @@ def fit_photographs(
 
     progress("finding skin, hair and what covers them")
     parts = [part_finder()((255 * image[:3].clamp(0, 1)).byte(), one) for image, one in zip(images, marks, strict=True)]
-    hats = [hat_lines(*one) for one in zip(photographs, parts, marks, strict=True)]
+    hats = [[] if settings.everything else hat_lines(*one) for one in zip(photographs, parts, marks, strict=True)]
     hatless = [without_hat(one, at) if hat else one for one, at, hat in zip(parts, marks, hats, strict=True)]
     fitting = replace(settings.fit, expression_prior=prior, annotated=bool(found))
     fitting = fitting if settings.everything else replace(fitting, parts=hatless)
