@@ -61,6 +61,19 @@ def test_names_decide_what_no_pose_shows() -> None:
     torch.testing.assert_close(found[1], torch.tensor([0.0, 0.8, 0.0, 0.4]), atol=5e-3, rtol=0)  # the pose is complete
 
 
+def test_sides_that_poses_show_together_drive_their_own_and_those_of_other_poses_the_other() -> None:
+    target = ("cheekSquint_L", "cheekSquint_R", "Corner_L")
+    smile = {"mouthSmileLeft": 1.0, "mouthSmileRight": 1.0}
+    poses = [
+        ExamplePose("smile", smile, {"cheekSquint_L": 0.4, "cheekSquint_R": 0.4}),
+        ExamplePose("frown", {"mouthFrownRight": 1.0}, {"Corner_L": 0.5}),
+    ]
+    rules = learn_shape_rules(poses, ARKIT, target).rules
+    assert rules["cheekSquint_L"].sum == pytest.approx({"cheekSquintLeft": 1.0, "mouthSmileLeft": 0.4}, abs=1e-3)
+    assert rules["cheekSquint_R"].sum == pytest.approx({"cheekSquintRight": 1.0, "mouthSmileRight": 0.4}, abs=1e-3)
+    assert rules["Corner_L"].sum == pytest.approx({"mouthFrownRight": 0.5}, abs=1e-3)
+
+
 def test_poses_and_what_is_learned_are_files(tmp_path: Path) -> None:
     (tmp_path / "poses.toml").write_text(
         "[smile]\nfrom = {mouthSmileLeft = 1.0}\nto = {Creature0 = 0.8, Creature1 = 0.3}\n"

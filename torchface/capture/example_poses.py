@@ -13,12 +13,14 @@ from torchface.files.documents import read_toml
 from torchface.io.tables.csv_table import TableReader
 from torchface.optim.box_qp import box_qp
 from torchface.shape_names import mapping, near_names, spelled_as
+from torchface.shape_names.arkit_names import side_written_out
 
 __all__ = ["ExamplePose", "LearnedRules", "learn_shape_rules", "load_example_poses"]
 
 _RIDGE, _SPARSITY = 1e-5, 3e-3
 _LARGEST_FACTOR = 4.0
 _LEAST_FACTOR = 0.01
+_CROSSED = 10.0  # times the sparsity, where a name says left and the other right
 _TOGETHER = 0.999
 _FROM, _TO = "from:", "to:"
 
@@ -113,7 +115,8 @@ def learn_shape_rules(poses: Sequence[ExamplePose], from_names: Sequence[str], t
         + \lambda \sum_{j \,\text{shown}} c_j
 
     for each shape of the character on its own, over the poses' weights x of the source and y of the character. m is
-    what the names say, so what no pose shows stays as it is without examples. Then again without the sparsity, over
+    what the names say, so what no pose shows stays as it is without examples; of two sides that poses show together
+    each drives its own. Then again without the sparsity, over
     the factors that it left.
 
     Args:
@@ -145,7 +148,8 @@ def learn_shape_rules(poses: Sequence[ExamplePose], from_names: Sequence[str], t
     gram = x.T @ x
     H = gram + _RIDGE * torch.eye(len(gram), dtype=torch.float64)
     f = -(y.T @ x + _RIDGE * named)[learned]
-    sparse = box_qp(H, f + _SPARSITY * shown, 0.0, _LARGEST_FACTOR)
+    crossed = _sides(to_names)[learned, None] * _sides(from_names) < 0
+    sparse = box_qp(H, f + _SPARSITY * shown * torch.where(crossed, _CROSSED, 1.0), 0.0, _LARGEST_FACTOR)
     factors = torch.zeros_like(sparse)
     for row, kept in enumerate(sparse >= _LEAST_FACTOR):  # each shape has sources of its own
         if kept.any():
@@ -158,6 +162,12 @@ def learn_shape_rules(poses: Sequence[ExamplePose], from_names: Sequence[str], t
     }
     mapped = shape_map(from_names, to_names, rules)(x)
     return LearnedRules(rules, x, y, mapped, tuple(_notes(x, shown, from_names)))
+
+
+def _sides(names: Sequence[str]) -> Tensor:
+    """1 for names that say left, -1 for right, 0 for others, (N,)."""
+    written = [side_written_out(name).lower() for name in names]
+    return torch.tensor([("left" in one) - ("right" in one) for one in written])
 
 
 def _row(pose: str, weights: Mapping[str, float], names: Sequence[str], whose: str) -> Tensor:

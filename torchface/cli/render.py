@@ -31,7 +31,8 @@ def render(
             folder.
         out: The .png or .jpg to write.
         weights: Pose of a rig, such as jawOpen=0.5 mouthSmileLeft=1.
-        take: Pose of a rig from a weight take, or from an animated .glb, FILE itself too, instead.
+        take: Pose of a rig from a weight take, or from an animated .glb, FILE itself too, instead; the head does not
+            turn.
         frame: Which frame of the take.
         yaw: Directions to look from, degrees; 0 is the front, 90 the viewer's right.
         height: Of the image, pixels.

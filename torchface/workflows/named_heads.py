@@ -22,7 +22,8 @@ SHIPPED = "head"
 _KIND = next(name for name, kind in KINDS.items() if kind is HeadModel)
 _BETTER = (
     "for a likeness of real people: torchface train morphable --ict FaceXModel, once, "
-    "with the folder of github.com/ICT-VGL/ICT-FaceKit (MIT); or --published FILE of GNM Head, FLAME or Basel"
+    "with the folder of github.com/ICT-VGL/ICT-FaceKit (MIT; its hair is a cap, without a shirt); or --published FILE "
+    "of GNM Head, FLAME or Basel"
 )
 
 

@@ -122,7 +122,8 @@ class FittedHead:
         """Whether the head is to be used, in a line; no landmark says whether skin and likeness are right."""
         residuals = self.fit.residuals[:, JAW:].square().sum(-1).nanmean(1).sqrt()
         off = float((residuals / eyes_distances(self.fit.landmarks)).max())
-        fit = f"eyes, nose and mouth lie {off:.1%} of the eyes' distance from the landmarks"
+        digits = 1 if f"{off:.1%}" != f"{_POOR:.1%}" else 2
+        fit = f"eyes, nose and mouth lie {off:.{digits}%} of the eyes' distance from the landmarks"
         look = f"look at {self.overlays[0].name} first" if self.overlays else "look at the rig first"
         warned = sum(line.startswith("WARNING") for line in self.remarks)
         stray, dark = self.stray, self.dark
