@@ -12,9 +12,11 @@ from matplotlib.figure import Figure
 from planted.face_paint import face_paint
 from planted.light_stage import LightStageSettings, render_lit_video
 from torchface.capture.own_rig.lighting import estimate_light
+from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io import load_image, load_rig, save_image
 from torchface.io.video import open_video
+from torchface.mesh import Mesh
 from torchface.registration import register
 from torchface.rendering.clay_shading import render
 from torchface.rendering.compositing import caption, from_figure, from_pillow, save_rendered_image, sheet
@@ -24,6 +26,7 @@ from torchface.synthetic import IDENTITY, Character, Look, character, draw_ident
 from torchface.synthetic.head.embedded_character import shown_rig
 from torchface.synthetic.stages.scanner import eyes_closed, scan_head
 from torchface.synthetic.stages.weight_curves import perform
+from torchface.synthetic.stages.wrinkles import WrinkledPerformer
 from torchface.viz.figures.face_views import FRONT, PROFILE, THREE_QUARTER, face_views
 from torchface.viz.figures.registration_views import registration_sheet
 from torchface.workflows.fit.photograph_rig import fit_photographs
@@ -164,6 +167,42 @@ def relight_picture() -> torch.Tensor:
     return sheet(pictures, 3)
 
 
+def enhancement_picture() -> torch.Tensor:
+    """A frame of two expressions together that were captured one by one: coarse, enhanced, and the truth."""
+    actor, head = WrinkledPerformer(vertices=60_000), shown_rig(performer(texture=False))
+    brows = ["browInnerUp", "browOuterUpLeft", "browOuterUpRight"]
+    smile = [f"{shape}{side}" for shape in ("mouthSmile", "cheekSquint", "eyeSquint") for side in ("Left", "Right")]
+    sneer = [f"{shape}{side}" for shape in ("browDown", "noseSneer") for side in ("Left", "Right")]
+    extremes = torch.zeros(3, len(actor.names))
+    for row, shapes in enumerate((brows, smile, sneer)):
+        extremes[row, actor.rig.index(shapes)] = 1.0
+    there_and_back = torch.cat([torch.linspace(0, 1, 8), torch.ones(4), torch.linspace(1, 0, 8)])[:, None]
+    weights = torch.cat([there_and_back * extreme for extreme in extremes])
+    captured = CapturedPerformance(
+        actor.frames(weights, 24.0),
+        actor.neutral.faces,
+        torch.arange(3).repeat_interleave(len(there_and_back)),
+        actor.neutral.vertices,
+        coarse=actor.smooth(weights),
+        landmarks=actor.neutral.landmarks,
+    )
+    take = there_and_back[:12] * (0.9 * extremes[0] + 0.7 * extremes[1])
+    coarse, truth = actor.smooth(take), actor.frames(take, 24.0)
+    enhanced = EnhancementModel.fit(captured, EnhancementSettings(fps=24.0))(coarse)
+    pose = torch.zeros(1, len(head.names))
+    pose[0, head.index(actor.names)] = take[-1]
+    inside = sum(head.neutral.annotations.regions[name] for name in ("eyeball_left", "eyeball_right", "mouth_interior"))
+    parts = head.neutral.faces[inside[head.neutral.faces].all(1)]  # the actor is skin alone
+    colors = torch.cat([torch.tensor([[0.72, 0.56, 0.47]]).expand(len(truth[0]), 3), vertex_albedo(head.neutral)])
+    faces = torch.cat([actor.neutral.faces, parts + len(truth[0])])
+    camera = look_at(torch.tensor([10.0, -12.0, 70.0]), 16.0, span=205.0, width=300, height=380)
+    pictures = [
+        caption(render(Mesh(torch.cat([frames[-1], head(pose)[0]]), faces), camera, colors, samples=3), title)
+        for title, frames in (("coarse animation", coarse), ("enhanced", enhanced), ("truth", truth))
+    ]
+    return sheet(pictures, 3)
+
+
 def _half(image: torch.Tensor) -> torch.Tensor:
     return torch.nn.functional.avg_pool2d(image[None, :3], 2)[0]
 
@@ -175,6 +214,7 @@ def main() -> None:
     save_rendered_image(registration_picture(), HERE / "images" / "registration.jpg")
     save_rendered_image(fit_picture(), HERE / "images" / "fit.jpg")
     save_rendered_image(relight_picture(), HERE / "images" / "relight.jpg")
+    save_rendered_image(enhancement_picture(), HERE / "images" / "enhancement.jpg")
     with Image.open(HERE.parent / "out" / "demo" / "frame_1.png") as image:
         save_rendered_image(from_pillow(image), HERE / "images" / "demo.jpg")
 
