@@ -3,6 +3,7 @@
 import _thread
 import json
 import math
+import signal
 import socket
 import struct
 import threading
@@ -68,10 +69,12 @@ def phone(
             figures.append(self)
 
     monkeypatch.setattr(live_session, "LiveFigures", Kept)
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background job ignores interrupts
     thread = threading.Thread(target=send)
     thread.start()
     yield
     thread.join()
+    signal.signal(signal.SIGINT, before)
 
 
 @contextmanager
