@@ -39,7 +39,7 @@ def demo(
 
     checked_count("--seed", seed, 0, LARGEST_SEED)
     from torchface.files.job_lock import job_lock
-    from torchface.workflows.demo.demo_page import result_rows, scene_rows, write_demo_page
+    from torchface.workflows.demo.demo_page import result_rows, scene_rows, story, write_demo_page
     from torchface.workflows.demo.run_demo import run_demo, scene_from
 
     with job_lock(out), progress_bars(quiet) as progress:
@@ -52,7 +52,8 @@ def demo(
     console.print(_table(scene.title, scene_rows(result)))
     console.print(_table("against the truth", result_rows(result), ("", "whole take", "frame by frame")))
     console.print(_table("solver.onnx", result.solver.rows()))
-    console.print(result.solver.verdict())
+    console.print(f"solver.onnx: {result.solver.verdict()}")
+    console.print(story(result), highlight=False)
     print_path(page)
 
 

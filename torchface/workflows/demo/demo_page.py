@@ -121,7 +121,7 @@ def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = N
     assert markers is not None
     on_mesh = result.attachment.on(scene.head.faces, result.rig(solved.weights[shown : shown + 1]))[0]
     sections = [
-        Section("The performance", _story(result), markup=markup),
+        Section("The performance", story(result), markup=markup),
         Section(
             "One frame",
             "The true and the solved face, and the distance between them. No marker sits on an eyeball: lids alone "
@@ -182,7 +182,7 @@ def write_demo_page(result: DemoResult, out: Path, progress: Progress | None = N
     return write_page(out, scene.title, sections)
 
 
-def _story(result: DemoResult) -> str:
+def story(result: DemoResult) -> str:
     """The demo in one sentence."""
     mesh, markers = result.solved.mesh_error, len(result.attachment.triangles)
     length = len(result.scene.weights) / result.scene.fps
