@@ -145,7 +145,7 @@ def relight_picture() -> torch.Tensor:
     weights = torch.zeros(1, len(rig.names))
     weights[0, rig.index(["mouthSmileLeft", "mouthSmileRight", "cheekSquintLeft", "cheekSquintRight"])] = 0.55
     planted = PointLight(
-        torch.tensor([0.13, 0.15, 0.2]), torch.tensor([1.0, 0.88, 0.74]), torch.tensor([-520.0, -280, 150])
+        torch.tensor([0.3, 0.31, 0.34]), torch.tensor([0.8, 0.72, 0.62]), torch.tensor([-420.0, -120, 420])
     )
     stage = LightStageSettings(width=600, height=360, samples=3, noise=0.006, span=300.0)
     with tempfile.TemporaryDirectory() as folder:
