@@ -77,7 +77,7 @@ def track_video(
     and makes anew what depends on something that has changed.
     """
     progress = progress or silent
-    progress("reading the models; the first run makes their graphs, once")
+    progress("reading the models; the first run makes their graphs, once, a minute or two")
     inputs, others = other_cameras(load_inputs(video, rig, settings or TrackSettings()))
     state = TrackState(out, inputs.reading_key)
     seconds: dict[str, float] = {}
