@@ -116,8 +116,8 @@ def learn_shape_rules(poses: Sequence[ExamplePose], from_names: Sequence[str], t
 
     for each shape of the character on its own, over the poses' weights x of the source and y of the character. m is
     what the names say, so what no pose shows stays as it is without examples; of two sides that poses show together
-    each drives its own. Then again without the sparsity, over
-    the factors that it left.
+    each drives its own, where names end in the side or write it out. Then again without the sparsity, over the factors
+    that it left.
 
     Args:
         poses: the examples; each is complete: what it does not list is 0.

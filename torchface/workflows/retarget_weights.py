@@ -83,8 +83,8 @@ def retarget_weights(
     said = unread_turns(weights)
     rules = {} if table is None else load_shape_rules(table)
     if poses is not None:
-        learned, told = _learned(poses, played.weights.names, target, files.out)
-        rules, faults, said = learned.rules | rules, [*faults, *learned.notes], (*said, *told)
+        learned, compared = _learned(poses, played.weights.names, target, files.out)
+        rules, faults, said = learned.rules | rules, [*faults, *learned.notes], (*said, *compared)
     try:
         shapes = shape_map(played.weights.names, target.names, rules)
     except NameMismatchError as error:

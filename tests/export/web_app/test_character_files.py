@@ -12,15 +12,13 @@ import pytest
 import torch
 from browser import posted
 from osc_receiver import values_by_address
-from planted_graph import write_planted_graph
 from rig_samples import corrective_sheet, named_sheet, quad_sheet
 from scipy.spatial.transform import Rotation
 from test_vrm_in_browser import browser as vrm_browser  # noqa: F401  (three-vrm's packages)
 
 from planted.characters import Planted, write_character
 from planted.glb_files import rewrite
-from torchface import BlendshapeRig, load_rig, load_take, save_rig
-from torchface.errors import NameMismatchError
+from torchface import load_rig, load_take, save_rig
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.gltf.gltf_document import read_document
@@ -29,7 +27,6 @@ from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.protocols.vmc_packets import VmcPackets
 from torchface.io.weights.weight_csv import save_weights_csv
 from torchface.shape_names import ARKIT, VRM1, mapping
-from torchface.workflows.browser_app import app_folder
 from torchface.workflows.browser_app.character import load_character
 from torchface.workflows.head_rotations import head_angles
 
@@ -388,31 +385,3 @@ def test_shapes_that_would_fill_the_memory_are_refused(run: Run, tmp_path: Path)
     mesh = {"primitives": [{"targets": [{"POSITION": 0}] * 60}], "extras": {"targetNames": ["jawOpen"] * 60}}
     path = document(tmp_path / "file.glb", meshes=[mesh], accessors=[{"count": 10**6}])
     assert "too large" in run("refusal", path)
-
-
-def test_shapes_that_move_nothing_are_named(tmp_path: Path) -> None:
-    rig = load_rig(sheet(tmp_path / "all.glb", ("jawOpen", "mouthPucker", "tongueOut")))
-    assert load_character(tmp_path / "all.glb").still == ()
-    deltas = rig.deltas * torch.tensor([1.0, 1.0, 0.0])[:, None, None]
-    save_rig(BlendshapeRig(rig.neutral, deltas, rig.names), tmp_path / "two.glb")
-    assert load_character(tmp_path / "two.glb").still == ("tongueOut",)
-
-
-def test_the_app_takes_a_mapping_and_does_not_count_the_tongue(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "page" / "assets").mkdir(parents=True)
-    for name in ("index.html", "assets/page.js"):
-        (tmp_path / "page" / name).write_text("page")
-    monkeypatch.setattr(app_folder, "built_page", lambda progress: tmp_path / "page")
-    write_planted_graph(tmp_path / "planted.onnx")
-    path = sheet(tmp_path / "sheet.glb", ("jawOpen", "Tongue_Out", "antenna", "jawOpen_tongueOut"))
-    report = app_folder.export_app(tmp_path / "app", path, tmp_path / "planted.onnx")
-    assert (report.driven, report.still) == (("jawOpen",), ("Tongue_Out", "antenna", "jawOpen_tongueOut"))
-    assert ("shapes that a face moves", "1 of 4") in report.rows()
-    (tmp_path / "names.toml").write_text("[Maw]\nsum = {jawOpen = 0.5}\n[Tip]\nsum = {tongueOut = 1}\n")
-    own = sheet(tmp_path / "own.glb", ("Maw", "Tip"))
-    with pytest.raises(NameMismatchError, match="or --mapping FILE"):
-        app_folder.export_app(tmp_path / "app", own, tmp_path / "planted.onnx")
-    planted, names = tmp_path / "planted.onnx", tmp_path / "names.toml"
-    assert app_folder.export_app(tmp_path / "app", own, planted, mapping=names).driven == ("Maw",)
-    rows = json.loads((tmp_path / "app" / "character.json").read_text())["sources"]
-    assert rows["Maw"] == [[ARKIT.index("jawOpen"), 0.5]]

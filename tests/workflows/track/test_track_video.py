@@ -166,9 +166,9 @@ def test_of_several_faces_the_one_asked_for_is_followed(filmed: Filmed, tmp_path
 def test_a_camera_that_is_given_without_its_error_is_named(done: Done) -> None:
     inputs = done.tracked.inputs
     given = replace(inputs, calibration=replace(inputs.calibration, error=None))
-    told = " ".join(replace(done.tracked, inputs=given).lines())
-    assert "camera: from camera.toml, of unknown error" in told
-    assert "none given" not in told
+    lines = " ".join(replace(done.tracked, inputs=given).lines())
+    assert "camera: from camera.toml, of unknown error" in lines
+    assert "none given" not in lines
     given = replace(inputs, calibration=replace(inputs.calibration, error=1.5, guessed=True))
     (line,) = (line for line in replace(done.tracked, inputs=given).lines() if line.startswith("camera: "))
     assert line == "camera: from camera.toml, its focal length a guess by a face, 1.50 px off when it was made"
