@@ -1,4 +1,4 @@
-"""Text from files as people may see it: what moves a cursor, colours a terminal or turns the line round is spelled."""
+"""Names and texts from files as people may see them: long lists cut short, harmful characters spelled out."""
 
 import html
 import re
