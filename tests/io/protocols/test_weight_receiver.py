@@ -7,6 +7,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -26,14 +27,32 @@ from torchface.shape_names import ARKIT
 WEIGHTS, ROTATIONS = torch.arange(52) / 64, torch.arange(9) / 16
 
 
-def played(receiver: WeightReceiver, packets: list[bytes], host: str = "127.0.0.1") -> list[ReceivedFace]:
-    """What comes out of packets that are sent one by one."""
-    faces = []
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for packet in packets:
-            sender.sendto(packet, (host, receiver.port))
-            faces += [face for _, face in receiver.faces(0.05 if packet is packets[-1] else 0.0)]
-    return faces + [face for _, face in receiver.faces(0.05)]
+def played(receiver: WeightReceiver, packets: list[bytes]) -> list[ReceivedFace]:
+    """What comes out of packets that are sent one by one from one port."""
+    with udp() as sender:
+        return sent(sender, receiver, packets)
+
+
+def udp() -> socket.socket:
+    return socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+
+
+def sent(sender: socket.socket, receiver: WeightReceiver, packets: list[bytes]) -> list[ReceivedFace]:
+    """What comes out of packets that are sent one by one, once all of them have come."""
+    faces, came = list[ReceivedFace](), receiver.counts.packets
+    for packet in packets:
+        sender.sendto(packet, ("127.0.0.1", receiver.port))
+        faces += arrived(receiver, came := came + 1)
+    return faces
+
+
+def arrived(receiver: WeightReceiver, packets: int) -> list[ReceivedFace]:
+    """The faces that have come when the receiver has counted so many packets: a busy machine delivers them late."""
+    faces, end = [], time.perf_counter() + 10
+    while receiver.counts.packets < packets and time.perf_counter() < end:
+        faces += [face for _, face in receiver.faces(0.01)]
+    assert receiver.counts.packets == packets
+    return faces
 
 
 @pytest.mark.real
@@ -74,7 +93,7 @@ def test_each_protocol_is_received_at_ipv4_and_ipv6(scheme: str, packets: list[b
             receiver._order.takes("nobody", None, float("inf"))  # whoever was first is gone
             receiver._order.sender = ""
             receiver._order._heard = float("-inf")
-            (face,) = [face for _, face in receiver.faces(0.5)]
+            (face,) = arrived(receiver, 2 * len(packets))
             torch.testing.assert_close(face.weights, WEIGHTS, atol=0.006, rtol=0)
 
 
@@ -82,7 +101,7 @@ def test_a_part_of_a_face_ends_no_wait() -> None:
     """Else each part would be a frame of its own, in which the face counts as not sent."""
     packets = VmcPackets(ARKIT)(WEIGHTS, ROTATIONS)
     assert len(packets) > 1
-    with WeightReceiver("vmc://127.0.0.1:0") as receiver, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+    with WeightReceiver("vmc://127.0.0.1:0") as receiver, udp() as sender:
         sender.connect(("127.0.0.1", receiver.port))
         sender.send(packets[0])
         rest = threading.Timer(0.1, lambda: [sender.send(packet) for packet in packets[1:]])
@@ -94,7 +113,7 @@ def test_a_part_of_a_face_ends_no_wait() -> None:
 @pytest.mark.skipif(sys.platform != "linux", reason="other systems have one address of their own, 127.0.0.1")
 def test_the_phone_is_asked_to_send_until_it_does(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("torchface.io.protocols.weight_receiver._ASK_AGAIN", 0.02)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as phone:
+    with udp() as phone:
         phone.bind(("127.0.0.2", 0))
         phone.settimeout(5)
         port = phone.getsockname()[1]
@@ -109,10 +128,11 @@ def test_the_phone_is_asked_to_send_until_it_does(monkeypatch: pytest.MonkeyPatc
             assert phone.recv(1024) == START
             (packet,) = IFacialMocapPackets(ARKIT)(WEIGHTS, None)
             phone.sendto(packet, ("127.0.0.1", asker[1]))
-            assert len(receiver.faces(1.0)) == 1
+            assert len(receiver.faces(5.0)) == 1
 
 
-def test_a_second_sender_and_another_version_are_counted() -> None:
+def test_a_second_sender_and_another_version_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("torchface.io.protocols.weight_receiver._SET", 10.0)  # of a machine that holds packets back
     packets = LiveLinkPackets(ARKIT, 60.0, "iPhone")
     frames = [packets(torch.full((52,), i / 10), None)[0] for i in range(6)]
     (other,) = LiveLinkPackets(ARKIT, 60.0, "iPad")(WEIGHTS, None)
@@ -130,13 +150,13 @@ def test_two_programs_of_one_name_at_one_address_are_not_mixed() -> None:
     packets = [LiveLinkPackets(ARKIT, 60.0, "iPhone") for _ in range(2)]
     with (
         WeightReceiver("livelink://127.0.0.1:0") as receiver,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second,
+        udp() as first,
+        udp() as second,
     ):
         for _ in range(20):
             for sender, encode, value in ((first, packets[0], 0.25), (second, packets[1], 0.75)):
                 sender.sendto(encode(torch.full((52,), value), None)[0], ("127.0.0.1", receiver.port))
-        faces = [face for _, face in receiver.faces(1.0)]
+        faces = arrived(receiver, 40)
         counts = receiver.counts
     assert {face.weights[0].item() for face in faces[3:]} == {0.25}
     assert counts.others >= 18
@@ -154,34 +174,41 @@ def test_parts_of_faces_of_two_programs_at_one_address_are_not_mixed(scheme: str
 
     with (
         WeightReceiver(f"{scheme}://127.0.0.1:0") as receiver,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first,
-        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second,
+        udp() as first,
+        udp() as second,
     ):
         for _ in range(20):
             for pair in zip(parts("jawOpen", 0.5), parts("cheekPuff", 0.75), strict=True):
                 for sender, packet in zip((first, second), pair, strict=True):
                     sender.sendto(packet, ("127.0.0.1", receiver.port))
-        faces = [face for _, face in receiver.faces(1.0)][3:]
+        faces = arrived(receiver, 40 if scheme == "osc" else 80)[3:]
     assert len(faces) >= 16
     assert {float(face.weights[ARKIT.index("jawOpen")]) for face in faces} == {0.5}
     assert {float(face.weights[ARKIT.index("cheekPuff")]) for face in faces} == {0.0}
 
 
 def test_parts_of_a_face_from_a_new_port_each_are_one_face() -> None:
-    with WeightReceiver("osc://127.0.0.1:0") as receiver:
+    with WeightReceiver("osc://127.0.0.1:0") as receiver, ExitStack() as ports:  # all stay open, so none comes again
         for name in ARKIT[:40]:
-            (face,) = played(receiver, [osc_message(f"/face/{name}", 0.5)])
+            (face,) = sent(ports.enter_context(udp()), receiver, [osc_message(f"/face/{name}", 0.5)])
     assert face.weights.count_nonzero() == 40
 
 
 def test_a_program_that_sends_each_frame_from_another_port_is_one_sender() -> None:
     encode = LiveLinkPackets(ARKIT, 60.0, "script")
-    with WeightReceiver("livelink://127.0.0.1:0") as receiver:
+    with WeightReceiver("livelink://127.0.0.1:0") as receiver, ExitStack() as ports:
         faces = []
         for i in range(12):
-            faces += played(receiver, encode(torch.full((52,), i / 16), None))
+            faces += sent(ports.enter_context(udp()), receiver, encode(torch.full((52,), i / 16), None))
     assert [face.weights[0].item() for face in faces] == [i / 16 for i in range(12)]
     assert receiver.counts.others == 0
+
+
+def test_a_port_that_comes_twice_by_chance_stops_no_program_that_changes_ports() -> None:
+    """Of 28,000 ports one of the last eight comes again each minute at 60 frames a second."""
+    order, ports = FrameOrder(), [1, 2, 3, 2, *range(4, 30)]
+    taken = [order.takes("script", i, i / 60, port) for i, port in enumerate(ports)]
+    assert taken == [True] * 4 + [False] * 3 + [True] * 23
 
 
 def test_a_program_that_begins_anew_at_another_port_is_taken_after_a_while() -> None:

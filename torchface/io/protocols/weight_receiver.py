@@ -26,6 +26,7 @@ _QUICKEST = 240  # frames a second that a clock counts on while its app sends no
 _RECENT = 30
 _FREE = 2.0  # seconds after which another sender may take over
 _PORTS = 8  # of a sender that are remembered
+_OTHER_PORTS = 4  # so many different ones, one after another, are of one that sends each frame from another port
 _NAMED = 5  # addresses
 
 
@@ -85,7 +86,7 @@ class FrameOrder:
         port is one sender.
         """
         if sender != self.sender or (self._port is not None and port != self._port):
-            if now - self._heard < _FREE:
+            if now - self._heard < _FREE and not self._changes_ports(sender, port):
                 self.counts.others += 1
                 return False
             self.sender, self._last, self._before = sender, None, None
@@ -117,6 +118,14 @@ class FrameOrder:
         self._last, self._taken = number, now
         self.counts.taken += 1
         return True
+
+    def _changes_ports(self, sender: str, port: int) -> bool:
+        """Whether the sender has no port of its own after all: one of those that it uses came twice by chance."""
+        if sender != self.sender:
+            return False
+        self._ports.append(port)
+        last = list(self._ports)[-_OTHER_PORTS:]
+        return self._port not in last and len(set(last)) == _OTHER_PORTS
 
 
 Read = Callable[[bytes], list[ReceivedFace]]  # faces of a packet; raises TorchfaceError where it is malformed
