@@ -69,10 +69,8 @@ def peers(solver: MarkerSolver, energy: CorrectiveEnergy, start: Tensor, method:
     )
     for frame in range(len(start)):
         here = energy.rows(torch.tensor([frame]))
-        f = here.extended.f[0] - torch.nn.functional.pad(
-            torch.full((80,), SPARSITY, dtype=torch.float64), (0, len(root) - 80)
-        )
-        target = -torch.linalg.solve_triangular(root.T, f[:, None], upper=False)[:, 0]
+        # The whole energy is a square: a root of the sparsity's term of its own would be steepest at zero.
+        target = -torch.linalg.solve_triangular(root.T, here.extended.f[0][:, None], upper=False)[:, 0]
 
         def value(w: np.ndarray, here: CorrectiveEnergy = here) -> tuple[float, np.ndarray]:
             at = torch.from_numpy(w)[None]
@@ -80,14 +78,11 @@ def peers(solver: MarkerSolver, energy: CorrectiveEnergy, start: Tensor, method:
 
         def residual(w: np.ndarray, target: Tensor = target) -> np.ndarray:
             at = torch.from_numpy(w)[None]
-            x = torch.cat([at, energy.activation(at)], 1)[0]
-            return torch.cat([root @ x - target, (2 * SPARSITY * at[0].clamp(min=0) + 1e-18).sqrt()]).numpy()
+            return (root @ torch.cat([at, energy.activation(at)], 1)[0] - target).numpy()
 
         def jacobian(w: np.ndarray) -> np.ndarray:
-            at = torch.from_numpy(w)[None]
-            by = torch.cat([torch.eye(80, dtype=torch.float64), energy.activation.jacobian(at)[0]])
-            own = torch.diag(SPARSITY / (2 * SPARSITY * at[0].clamp(min=0) + 1e-18).sqrt())
-            return torch.cat([root @ by, own]).numpy()
+            by = energy.activation.jacobian(torch.from_numpy(w)[None])[0]
+            return (root @ torch.cat([torch.eye(80, dtype=torch.float64), by])).numpy()
 
         w0 = start[frame].double().numpy()
         if method == "SLSQP":
