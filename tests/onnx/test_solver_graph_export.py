@@ -53,7 +53,7 @@ def test_the_file_is_the_graph(written: SolverReport, turned_bumps: MarkerSolver
     assert "30% of the markers missing" in str(written)
     assert list(path.parent.iterdir()) == [path]
 
-    graph = solver_graph(turned_bumps, random_frames(turned_bumps, 512))
+    graph = solver_graph(turned_bumps)
     assert graph.rho == written.rho
     markers = random_frames(turned_bumps, 20, seed=5)
     markers[3, 7] = torch.nan

@@ -196,7 +196,7 @@ def export_marker_solver(
     solver = copy.deepcopy(solver).cpu().float()
     frames = _frames(solver, markers)
     progress("choosing the graph's settings")
-    graph = solver_graph(solver, frames, steps)
+    graph = solver_graph(solver, markers, steps)
     if not hybrid:
         return _export(graph, solver, frames, (), path, facts, progress)
     generator = torch.Generator().manual_seed(1)
@@ -207,9 +207,10 @@ def export_marker_solver(
 
 
 def solver_graph(
-    solver: MarkerSolver, frames: Tensor, steps: GraphSteps = GraphSteps()
+    solver: MarkerSolver, markers: Tensor | None = None, steps: GraphSteps = GraphSteps()
 ) -> SolverGraph | CorrectiveGraph:
-    """The graph of a solver, on the CPU, its rho chosen for frames (T,M,3) without gaps."""
+    """The graph of a solver, on the CPU, its rho chosen for markers (T,M,3) without gaps; of poses of few shapes if
+    absent, whose rho is the best for real takes too."""
     if solver.activation is not None:
         if steps.method != "splitting":
             raise ValueRangeError(f"method: found {steps.method} for a rig with correctives, expected splitting")
@@ -219,6 +220,7 @@ def solver_graph(
         seen, gaps = steps.seen or GRADIENT_STEPS, steps.with_gaps or GRADIENT_STEPS_WITH_GAPS
         return SolverGraph(solver, ProjectedGradient(H, steps=seen), ProjectedGradient(steps=gaps))
     seen, gaps = steps.seen or STEPS, steps.with_gaps or STEPS_WITH_GAPS
+    frames = random_frames(solver, _TEST_FRAMES, shares=_ACTIVE[:1]) if markers is None else markers.cpu().float()
     rho = choose_rho(solver, seen, frames)
     return SolverGraph(solver, FixedSplitting(H, steps=seen, rho=rho), FixedSplitting(steps=gaps, rho=rho))
 
@@ -307,12 +309,14 @@ def choose_rho(solver: MarkerSolver, steps: int, markers: Tensor) -> float:
     return min(_RHOS, key=gap)
 
 
-def random_frames(solver: MarkerSolver, count: int, noise: float = 0.3, seed: int = 0) -> Tensor:
-    """Markers (T,M,3) that move from a random pose of few shapes to one of many, and so on, with noise in millimetres,
-    in marker space."""
+def random_frames(
+    solver: MarkerSolver, count: int, noise: float = 0.3, seed: int = 0, shares: tuple[float, ...] = _ACTIVE
+) -> Tensor:
+    """Markers (T,M,3) that move from one random pose to the next, with noise in millimetres, in marker space; poses
+    have these shares of the shapes in turn, few and many if absent."""
     generator = torch.Generator().manual_seed(seed)
     poses = (count // _FRAMES_A_POSE + 2, len(solver.names))
-    active = torch.rand(poses, generator=generator) < torch.tensor(_ACTIVE)[torch.arange(poses[0]) % 2, None]
+    active = torch.rand(poses, generator=generator) < torch.tensor(shares)[torch.arange(poses[0]) % len(shares), None]
     keys = active * torch.rand(poses, generator=generator).square()
     time_ = torch.arange(count) / _FRAMES_A_POSE
     before, share = time_.long(), time_.frac()[:, None]
