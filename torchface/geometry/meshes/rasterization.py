@@ -1,6 +1,5 @@
 """Triangles drawn into pixels: the texels of a layout, and pictures that must be quick, nearest in front."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -90,13 +89,16 @@ def rasterise_uvs(uvs: Tensor, uv_faces: Tensor, height: int, width: int) -> Tex
     planes = _Planes.of(points, uv_faces.cpu().numpy(), height, width, _ON_EDGE, _LEAST_TEXEL_AREA)
     _refuse_overlap(int(planes.rows.sum()), height * width)
     owner = np.full(height * width, -1)
-    covered = 0
-    for row, column, plane in planes.samples(width, _ON_EDGE):
-        covered += len(row)
-        _refuse_overlap(covered, len(owner))
-        row *= width
-        row += column
-        owner[row[::-1]] = plane[::-1]  # of triangles that overlap the first is written last
+    plane, row, begin, count = planes.spans(width, _ON_EDGE)
+    total = count.cumsum()
+    pixels = int(total[-1]) if len(total) else 0
+    _refuse_overlap(pixels, len(owner))
+    cuts = [0, *np.searchsorted(total, np.arange(_BATCH, pixels, _BATCH)), len(count)]
+    for start, stop in reversed(list(pairwise(cuts))):
+        piece = slice(start, stop)
+        run, column = _expanded(count[piece], begin[piece])
+        texel = (row[piece] * width).take(run) + column
+        owner[texel[::-1]] = plane[piece].take(run)[::-1]  # of triangles that overlap the first is written last
     texels = np.flatnonzero(owner >= 0)
     triangles = planes.triangle[owner[texels]]
     faces, barycentric = uv_faces.cpu().numpy(), np.empty((len(texels), 3))
@@ -132,8 +134,8 @@ class DrawnPixels:
     triangle: Tensor  # in front there, (S,) int64
     nearness: Tensor  # as the corners', interpolated, (S,) float32
     planes: "_Planes"
-    # Row and column of each pixel, float32, and which of the planes it is of.
-    at: tuple[np.ndarray, np.ndarray, np.ndarray]
+    # The plane and the row, float32, of each span; of each pixel its span, and its column, float32.
+    at: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]
 
     def interpolated(self, values: Tensor) -> Tensor:
         """Values (F,3) of triangles' corners at the pixels, (S,) float32, linear in the image."""
@@ -160,28 +162,30 @@ def rasterise(points: Tensor, nearness: Tensor, faces: Tensor, height: int, widt
     triangles = faces.cpu().numpy()
     # Rows count downward: what is counter-clockwise on the mesh is clockwise here.
     planes = _Planes.of(xy, triangles, height, width, _SLACK, _LEAST_AREA, facing=True)
-    row, column, plane = next(planes.samples(width, _SLACK, None))
-    places = row.astype(np.float32), column.astype(np.float32)
-    value = _at_pixels(planes.linear(near[triangles[planes.triangle].T]), *places, plane)
-    row *= width
-    row += column
-    pixel = row
+    plane, row, begin, count = planes.spans(width, _SLACK)
+    span, column = _expanded(count, begin)
+    pixel = (row * width).take(span)
+    pixel += column
+    at = plane, row.astype(np.float32), span, column.astype(np.float32)
+    value = _at_pixels(planes.linear(near[triangles[planes.triangle].T]), *at)
     kept = _nearest(pixel, value, height * width)
-    at = places[0].take(kept), places[1].take(kept), plane.take(kept)
-    parts = (pixel.take(kept), planes.triangle.take(at[2]), value.take(kept))
+    at = *at[:2], span.take(kept), at[3].take(kept)
+    parts = (pixel.take(kept), planes.triangle.take(plane).take(at[2]), value.take(kept))
     covered, triangle, closeness = (torch.from_numpy(part) for part in parts)
     return DrawnPixels(covered, triangle, closeness, planes, at)
 
 
-def _at_pixels(planes: np.ndarray, row: np.ndarray, column: np.ndarray, plane: np.ndarray) -> np.ndarray:
-    """Linear functions (3,P) at rows and columns (S,), each that of its number ``plane`` (S,); float32, for speed."""
+def _at_pixels(
+    planes: np.ndarray, plane: np.ndarray, row: np.ndarray, span: np.ndarray, column: np.ndarray
+) -> np.ndarray:
+    """Linear functions (3,P) at pixels (S,), as ``DrawnPixels.at`` has them; float32, for speed."""
     across, down, rest = planes.astype(np.float32)
-    value = down.take(plane)
-    value *= row
-    value += rest.take(plane)
-    other = across.take(plane)
-    other *= column
-    value += other
+    start = down.take(plane)
+    start *= row
+    start += rest.take(plane)
+    value = across.take(plane).take(span)
+    value *= column
+    value += start.take(span)
     return value
 
 
@@ -217,20 +221,17 @@ class _Planes:
         facing: bool = False,
     ) -> "_Planes":
         """Of points (2,V) and faces (F,3); with ``facing`` clockwise ones are left out, as rows count downward."""
-        x, y = points
-        corners = faces.T.copy()
-        (x0, x1, x2), (y0, y1, y2) = x[corners], y[corners]
+        xs, ys = points.take(faces.T, axis=1)
+        (x0, x1, x2), (y0, y1, y2) = xs, ys
         with np.errstate(invalid="ignore"):
             area = (x2 - x0) * (y1 - y0) - (x1 - x0) * (y2 - y0)
             size = area if facing else np.abs(area)
-        solid = np.flatnonzero((size > least_area) & (size < np.inf))
-        (x0, x1, x2), (y0, y1, y2) = x[corners[:, solid]], y[corners[:, solid]]
         low, high = np.minimum(np.minimum(y0, y1), y2), np.maximum(np.maximum(y0, y1), y2)
         left, right = np.minimum(np.minimum(x0, x1), x2), np.maximum(np.maximum(x0, x1), x2)
         inside = (high >= -slack) & (low <= height - 1 + slack) & (right >= -slack) & (left <= width - 1 + slack)
-        low, high, triangle = low[inside], high[inside], solid[inside]
-        corners = corners[:, triangle]
-        xs, ys, share = x[corners], y[corners], 1 / area[triangle]
+        triangle = np.flatnonzero((size > least_area) & (size < np.inf) & inside)
+        xs, ys = xs.take(triangle, axis=1), ys.take(triangle, axis=1)
+        low, high, share = low[triangle], high[triangle], 1 / area[triangle]
         edges = np.empty((3, 3, len(triangle)))
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
             edges[i] = (ys[k] - ys[j]) * share, (xs[j] - xs[k]) * share, (xs[k] * ys[j] - xs[j] * ys[k]) * share
@@ -242,11 +243,9 @@ class _Planes:
         """Values at each triangle's corners, (3,P), as linear functions a, b and c of the pixel, (3,P)."""
         return (corners[:, None] * self.edges).sum(0)
 
-    def samples(
-        self, width: int, slack: float, batch: int | None = _BATCH
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Row and column of every pixel that a triangle covers, and which of the P it is; each (S,) int64, by
-        triangle, in batches of about so many pixels. Triangles are wider by ``slack`` pixels."""
+    def spans(self, width: int, slack: float) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Each row of pixels of each triangle: which of the P, the row, its first column and how many pixels; (R,)
+        int64, by triangle. Triangles are wider by ``slack`` pixels."""
         plane, row = _expanded(self.rows, self.first)
         left, right = np.full(len(plane), -np.inf), np.full(len(plane), np.inf)
         for a, b, c in self.edges:  # the three borders of every row
@@ -260,19 +259,16 @@ class _Planes:
             np.minimum(right, crossing, out=right, where=ends)
         begin = np.ceil(left - slack).clip(0, width).astype(np.int64)
         end = np.floor(right + slack).clip(-1, width - 1).astype(np.int64)
-        count = (end - begin + 1).clip(0)
-        total = count.cumsum()
-        pixels = int(total[-1]) if len(total) else 0
-        cuts = [0, *np.searchsorted(total, np.arange(batch or pixels, pixels, batch or 1)), len(count)]
-        for start, stop in reversed(list(pairwise(cuts))):
-            piece = slice(start, stop)
-            span, column = _expanded(count[piece], begin[piece])
-            yield row[piece].take(span), column, plane[piece].take(span)
+        return plane, row, begin, (end - begin + 1).clip(0)
 
 
 def _expanded(counts: np.ndarray, first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """For each of some runs of ``counts`` whole numbers: which run, and the numbers from its first on."""
-    run = np.repeat(np.arange(len(counts)), counts)
-    numbers = (first - (np.cumsum(counts) - counts)).take(run)
-    numbers += np.arange(len(run))
+    begins = np.cumsum(counts) - counts
+    total = int(counts.sum())
+    # Counts of begins, summed up: for short runs np.repeat takes longer, as NumPy's own sum does.
+    run = torch.from_numpy(np.bincount(begins, minlength=total)[:total]).cumsum(0).numpy()
+    run -= 1
+    numbers = (first - begins).take(run)
+    numbers += np.arange(total)
     return run, numbers
