@@ -63,3 +63,16 @@ def test_teeth_are_dark_behind_lips_that_are_hardly_apart() -> None:
         assert (drawn <= evenly).all()
         changed = evenly.sum(2) - drawn.sum(2) > 60
         assert changed.sum() > 200 if jaw < 0.1 else not changed.any()
+
+
+def test_irises_end_without_stairs() -> None:
+    """Beside the whites, in the row through an eye's middle, lies a pixel of a colour between."""
+    head = performer(texture=False).neutral
+    intrinsics = torch.tensor([[3000.0, 0, 160], [0, 3000, 160], [0, 0, 1]]).double()
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    eye = head.vertices[head.landmarks[36:42]].mean(0).double()
+    camera = Camera(intrinsics, flip, torch.tensor([0.0, 0, 400]).double() - flip @ eye, 320, 320)
+    row = QuickClay.of(head).draw(head.vertices, camera)[160, :, 2].astype(float)
+    iris, white = row[140], row[100:220].max()
+    assert white > iris + 100
+    assert abs(row[101:220] - row[100:219]).max() < 0.7 * (white - iris)

@@ -33,6 +33,7 @@ _GAMMA = 2.2  # sRGB, nearly
 _DARKER = 0.85  # irises beside the whites of eyes
 _SMALLEST = 1.0  # millimetres before the lens
 _JUMP = 0.012  # of the nearness; neighbours that differ by more are an edge
+_APART = 10.0  # times the nearness, by which parts and tints lie apart where edges are sought
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,12 +93,13 @@ class QuickClay:
         row = self.part * _TINT_LEVELS
         if tint is not None:
             row = row + (tint[self.faces].mean(1) * (_TINT_LEVELS - 1)).round().clamp(0, _TINT_LEVELS - 1).long()
-        index = (row * _LEVELS)[drawn.triangle] + (light * (_LEVELS - 1)).clamp(0, _LEVELS - 1).long()
+        row = row.index_select(0, drawn.triangle)
+        index = row * _LEVELS + (light * (_LEVELS - 1)).clamp(0, _LEVELS - 1).long()
         colors = self.colors.take(index.numpy())
         if self.paint is not None:
             self._paint_skin(colors, drawn, light)
         image[drawn.pixel.numpy()] = colors
-        return _smooth_edges(_three(image.view(np.uint8).reshape(size)), drawn)
+        return _smooth_edges(_three(image.view(np.uint8).reshape(size)), drawn, row)
 
     def _paint_skin(self, colors: np.ndarray, drawn: DrawnPixels, light: Tensor) -> None:
         """Overwrites colours (S,) of what is no part with the texture's in the light (S,)."""
@@ -172,10 +174,12 @@ def _three(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_RGBA2RGB)
 
 
-def _smooth_edges(image: np.ndarray, drawn: DrawnPixels) -> np.ndarray:
-    """The image with its outlines blurred by a pixel, so that they do not crawl."""
+def _smooth_edges(image: np.ndarray, drawn: DrawnPixels, kind: Tensor) -> np.ndarray:
+    """The image with its outlines, and those of parts and tints, ``kind`` (S,), blurred by a pixel, so that they do not
+    crawl."""
     near = np.zeros(image.shape[:2], np.float32)
-    near.reshape(-1)[drawn.pixel.numpy()] = drawn.nearness.numpy()
-    square = np.ones((3, 3), np.uint8)
-    edge = cv2.morphologyEx(near, cv2.MORPH_GRADIENT, square) > _JUMP * near.max(initial=0.0)
+    most = float(drawn.nearness.amax()) if len(kind) else 0.0
+    # As if each kind lay far before the one below.
+    near.reshape(-1)[drawn.pixel.numpy()] = (drawn.nearness + _APART * most * kind).numpy()
+    edge = cv2.morphologyEx(near, cv2.MORPH_GRADIENT, np.ones((3, 3), np.uint8)) > _JUMP * most
     return cv2.copyTo(cv2.GaussianBlur(image, (3, 3), 0), edge.view(np.uint8), image)
