@@ -35,15 +35,17 @@ export function readLiveLinkCsv(text) {
     throw new Error("this is no recording of ARKit's shapes. A .csv of Live Link Face or of torchface begins with Timecode or frame,time and their names.");
   const rows = lines.map((line) => line.split(","));
   const seconds = clock === undefined ? rows.map((row) => Number(row[time])) : clockSeconds(rows.map((row) => row[clock]));
+  const wrong = rows.findIndex((row, frame) => row.length < names.length || !Number.isFinite(seconds[frame]) || shapes.some(([, i]) => !Number.isFinite(Number(row[i]))));
+  if (wrong >= 0) throw new Error(`row ${wrong + 1} is cut short, or its time or a weight is no number.`);
   const take = new Take();
   rows.forEach((row, frame) => {
     const number = (name) => Number(row[column.get(name.toLowerCase())] ?? 0) || 0;
     const angles = (part) => ["Yaw", "Pitch", "Roll"].map((axis) => number(part + axis));
     const weights = new Float32Array(ARKIT.length);
-    for (const [shape, i] of shapes) weights[shape] = Math.min(1, Math.max(0, Number(row[i]) || 0));
+    for (const [shape, i] of shapes) weights[shape] = Math.min(1, Math.max(0, Number(row[i])));
     const [left, right] = [angles("LeftEye"), angles("RightEye")];
     const gaze = Float32Array.of(-right[0], -right[1], -left[0], -left[1]);
-    if (Number.isFinite(seconds[frame])) take.add(1000 * seconds[frame], { weights, rotation: headRotation(angles("Head")), gaze });
+    take.add(1000 * seconds[frame], { weights, rotation: headRotation(angles("Head")), gaze });
   });
   if (take.frames.length === 0 || take.duration > LONGEST) throw new Error("its times are missing, do not rise, or are longer than an hour.");
   return take;

@@ -1,4 +1,4 @@
-// A take as a VRM animation (.vrma): neck and head, the gaze, and VRM's expressions, or ARKit's for a character that has these.
+// A take as a VRM animation (.vrma): neck and head, the gaze, and VRM's expressions, or ARKit's for a character with a jaw among these.
 
 import { ARKIT } from "./arkit_names.js";
 import { gazeTurn, NECKS, turn } from "./character.js";
@@ -32,7 +32,7 @@ export function vrmExpressions(weights) {
   return named;
 }
 
-/** ARKit's shapes that a VRM has as expressions of its own ("perfect sync"), by what it calls them. */
+/** ARKit's shapes that a VRM has as expressions of its own, by what it calls them. */
 function ownExpressions({ extensions = {} }) {
   const names = [...Object.keys(extensions.VRMC_vrm?.expressions?.custom ?? {}), ...(extensions.VRM?.blendShapeMaster?.blendShapeGroups ?? []).map(({ name }) => name)];
   const rows = new Map(ARKIT.map((arkit, row) => [arkit.toLowerCase(), row]));
@@ -71,8 +71,10 @@ export function vrmAnimation(take, character) {
     drive(made, "translation", values.flatMap((value) => [value, 0, 0]), "VEC3");
     return { node: made };
   };
-  const own = ownExpressions(character.document), presets = own.length > 0 ? [] : take.frames.map(({ weights }) => vrmExpressions(weights));
-  const preset = own.length > 0 ? {} : Object.fromEntries(Object.keys(VRM_POSES).map((name) => [name, expression(name, presets.map((all) => all[name]))]));
+  const all = ownExpressions(character.document), synced = all.some(([, row]) => ARKIT[row] === "jawOpen"); // "perfect sync"
+  const own = synced ? all : all.filter(([, row]) => POSES.every((pose) => pose[row] === 0)); // others would move twice
+  const presets = synced ? [] : take.frames.map(({ weights }) => vrmExpressions(weights));
+  const preset = synced ? {} : Object.fromEntries(Object.keys(VRM_POSES).map((name) => [name, expression(name, presets.map((all) => all[name]))]));
   const custom = Object.fromEntries(own.map(([name, row]) => [name, expression(name, take.frames.map(({ weights }) => weights[row]))]));
   document.animations = [{ name: "performance", samplers, channels }];
   document.extensionsUsed = ["VRMC_vrm_animation"];
