@@ -6,6 +6,7 @@ import pytest
 import torch
 from planted_faces import JAW, SMILE
 
+from planted.glb_files import rewrite
 from torchface import BlendshapeRig, save_rig
 from torchface.errors import FileFormatError
 from torchface.shape_names import ARKIT
@@ -41,6 +42,28 @@ def test_shapes_by_other_programs_names_move(dome_rig: BlendshapeRig, tmp_path: 
     weights = torch.rand(3, 52)
     expected = weights[:, [JAW, ARKIT.index("eyeBlinkLeft"), SMILE]]
     torch.testing.assert_close(moved.weights(weights), torch.cat([expected, torch.zeros(3, 1)], 1))
+
+
+@pytest.mark.parametrize("version", ["VRMC_vrm", "VRM"])
+def test_a_vrm_moves_by_what_its_expressions_say(dome_rig: BlendshapeRig, tmp_path: Path, version: str) -> None:
+    """Where targets' names say nothing; a name that is known counts before an expression, and vowels do not double."""
+    names = ["m_0", "m_1", "mouthSmile_L", "Fcl_MTH_A"]
+    path = tmp_path / "avatar.vrm"
+    save_rig(BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names), tmp_path / "dome.glb")
+    bound = {"JawOpen": (0, 0.8), "blinkLeft": (1, 1.0), "mouthSmileLeft": (0, 1.0)}
+    one = {
+        name: {"morphTargetBinds": [{"node": 0, "index": row, "weight": weight}]}
+        for name, (row, weight) in bound.items()
+    }
+    zero = [
+        {"name": name, "presetName": "unknown", "binds": [{"mesh": 0, "index": row, "weight": 100 * weight}]}
+        for name, (row, weight) in bound.items()
+    ]
+    said = {"VRMC_vrm": {"expressions": {"custom": one}}, "VRM": {"blendShapeMaster": {"blendShapeGroups": zero}}}
+    rewrite(tmp_path / "dome.glb", lambda root: root.update(extensions={version: said[version]}), path)
+    weights = torch.rand(3, 52)
+    expected = weights[:, [JAW, ARKIT.index("eyeBlinkLeft"), SMILE, JAW]] * torch.tensor([0.8, 1.0, 1.0, 0.0])
+    torch.testing.assert_close(load_character(path).weights(weights), expected)
 
 
 def test_characters_that_cannot_move(dome_rig: BlendshapeRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

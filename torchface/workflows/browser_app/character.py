@@ -22,9 +22,10 @@ from torchface.io.gltf.gltf_document import Document, document_of
 from torchface.io.gltf.primitive_reading import moving_target_names, read_target_names
 from torchface.io.scenes.missing_shapes import no_shapes, no_target
 from torchface.io.tables.csv_table import quoted
+from torchface.io.vrm.vrm_expressions import vrm_expressions
 from torchface.progress import Progress, silent
 from torchface.rig import BlendshapeRig
-from torchface.shape_names import ARKIT, recognised_shapes, spelled_as, vowel_sources
+from torchface.shape_names import ARKIT, RecognisedShape, arkit_name, recognised_shapes, spelled_as, vowel_sources
 from torchface.synthetic import character
 from torchface.workflows.cached_graph import cached_file
 
@@ -139,7 +140,7 @@ def load_character(path: str | Path | None = None, table: Path | None = None, pr
     document = document_of(Path(path or name), data)
     definitions = scene_correctives(document)
     names = _shapes(document, {definition.name for definition in definitions})
-    rules = _recognised(names) if table is None else load_shape_rules(table)
+    rules = _recognised(names, document) if table is None else load_shape_rules(table)
     activation = CorrectiveActivation(definitions, names) if definitions else None
     try:
         return Character(name, data, shape_map(ARKIT, names, rules), activation)
@@ -162,18 +163,36 @@ def _shapes(document: Document, followers: set[str]) -> tuple[str, ...]:
     return names
 
 
-def _recognised(names: Sequence[str]) -> dict[str, ShapeRule]:
-    """Rules for shapes that other programs call otherwise, such as ``A25_Jaw_Open`` or ``Fcl_EYE_Close_L``."""
+def _recognised(names: Sequence[str], document: Document) -> dict[str, ShapeRule]:
+    """Rules for shapes that other programs call otherwise, such as ``A25_Jaw_Open`` or ``Fcl_EYE_Close_L``, or that a
+    VRM's expressions name."""
     found = recognised_shapes(names)
+    said = _by_expressions(document, found)
     rules = {
         name: ShapeRule({arkit: 1.0})
         for arkit, shape in found.items()
         for name in shape.names
         if spelled_as(name, ARKIT) is None
     }
-    if "jawOpen" not in found:  # the mouth opens by vowels
+    if "jawOpen" not in found and not any("jawOpen" in sums for sums in said.values()):  # the mouth opens by vowels
         rules |= {name: ShapeRule(sources) for name in names if (sources := vowel_sources(name))}
-    return rules
+    return rules | {name: ShapeRule(sums) for name, sums in said.items()}
+
+
+def _by_expressions(document: Document, found: Mapping[str, RecognisedShape]) -> dict[str, dict[str, float]]:
+    """What a VRM's expressions take of ARKit's weights for targets by other names than those ``found``."""
+    meshes = [read_target_names(document, i) for i in range(len(document.objects("meshes")))]
+    known = {name for shape in found.values() for name in shape.names}
+    sums: dict[str, dict[str, float]] = {}
+    for expression, binds in vrm_expressions(document).items():
+        arkit = arkit_name(expression)
+        if arkit is None or arkit not in ARKIT or arkit in found:
+            continue
+        for bind in binds:
+            for name in read_target_names(document, bind.mesh)[bind.target : bind.target + 1]:
+                if name not in known and {i for i, row in enumerate(meshes) if name in row} <= {b.mesh for b in binds}:
+                    sums.setdefault(name, {})[arkit] = bind.weight
+    return sums
 
 
 def _taken(path: Path) -> bytes:
