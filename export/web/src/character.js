@@ -11,7 +11,7 @@ import { upright } from "./head_angles.js";
 import { wrinkleMaps } from "./wrinkle_maps.js";
 
 export const NECKS = 0.3; // of the head's rotation, where there is a neck
-const STILL = 1e-6; // of the character's size: what moves less does not move
+const BOUND = 0.5, LEAST = 0.05; // of an eye's vertices to its bone; of a shape's largest motion, that an eye looks by it
 const RAISED = -0.5; // of an arm's way downwards; arms that hang lower stay
 const HANGING = [0.22, -0.97, 0.08]; // an arm at rest: outwards, up, forwards
 const LOOKS = ARKIT.flatMap((name, row) => (name.startsWith("eyeLook") ? [row] : []));
@@ -112,14 +112,13 @@ export class Character {
     this.#moved.push({ object, influences: object.morphTargetInfluences, shapes: driven });
   }
 
-  /** Whether an eye is moved by looking shapes of its own, so that turning it would move it twice. */
+  /** Whether an eye is moved by looking shapes, of its own mesh or of one whose skin binds it, so that turning it would move it twice. */
   #looksByShapes(eye) {
-    const size = this.box.getSize(new THREE.Vector3()).length();
-    return this.#moved.some(
-      ({ object, shapes }) =>
-        (object === eye || object.parent === eye) &&
-        shapes.some(([row, { sources: [[source]] }]) => LOOKS.includes(source) && reach(object, row) > STILL * size),
-    );
+    return this.#moved.some(({ object, shapes }) => {
+      const own = object === eye || object.parent === eye, bone = own ? null : (object.skeleton?.bones.indexOf(eye) ?? -1);
+      if (bone === -1) return false;
+      return shapes.some(([row, { sources: [[source]] }]) => LOOKS.includes(source) && reach(object, row, bone) > LEAST * reach(object, row));
+    });
   }
 
   /** Of what the shapes move, for a whole body its face; with some room, and no larger than the character. */
@@ -204,10 +203,12 @@ export function gazeTurn(gaze, eye) {
   return new THREE.Quaternion().setFromEuler(new THREE.Euler(-up, aside, 0, "YXZ"));
 }
 
-function reach(mesh, row) {
-  const deltas = mesh.geometry.morphAttributes.position?.[row];
+/** How far a shape moves vertices, those alone that are bound to a bone, or all. */
+function reach(mesh, row, bone = null) {
+  const { skinIndex, skinWeight } = mesh.geometry.attributes, deltas = mesh.geometry.morphAttributes.position?.[row];
+  const bound = (i) => bone === null || [0, 1, 2, 3].some((k) => skinIndex.getComponent(i, k) === bone && skinWeight.getComponent(i, k) > BOUND);
   let most = 0;
   for (let i = 0; i < (deltas?.count ?? 0); i++)
-    most = Math.max(most, Math.hypot(deltas.getX(i), deltas.getY(i), deltas.getZ(i)));
+    if (bound(i)) most = Math.max(most, Math.hypot(deltas.getX(i), deltas.getY(i), deltas.getZ(i)));
   return most;
 }

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from test_vrm_in_browser import browser as vrm_browser  # noqa: F401  (three-vrm's packages)
 
 from planted.characters import Planted, write_character
-from planted.glb_files import rewrite
+from planted.glb_files import packed, rewrite, unpacked
 from torchface import load_rig, load_take, save_rig
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.animation_reading import read_gltf_weights
@@ -356,6 +356,35 @@ def test_eyes_that_no_shape_moves_turn_in_the_head(run: Run, tmp_path: Path) -> 
     x, y, z = np.sin(0.2) * np.cos(0.1), np.sin(0.1), np.cos(0.2) * np.cos(0.1)  # 0.2 to the person's left, 0.1 up
     expected = [np.cos(0.3) * x + np.sin(0.3) * z, y, np.cos(0.3) * z - np.sin(0.3) * x]
     np.testing.assert_allclose(way, expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("bone", ["Head", "LeftEye"])
+def test_an_eye_whose_skin_looks_by_shapes_is_not_turned_too(run: Run, tmp_path: Path, bone: str) -> None:
+    """Lids that are bound to the head leave the eye to its bone; page and Python decide alike."""
+    path = sheet(tmp_path / "skinned.glb", ("jawOpen", "eyeLookUpLeft"))
+    root, binary = unpacked(path)
+    first, at = len(root["nodes"]), len(binary)
+    (primitive,) = root["meshes"][0]["primitives"]
+    count = root["accessors"][primitive["attributes"]["POSITION"]]["count"]
+    joints, weights = np.zeros((count, 4), np.uint8), np.zeros((count, 4), np.float32)
+    joints[:, 0], weights[:, 0] = ("Head", "LeftEye", "RightEye").index(bone), 1.0
+    for name, values, kind in (("JOINTS_0", joints, 5121), ("WEIGHTS_0", weights, 5126)):
+        root["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": values.nbytes})
+        view = {"bufferView": len(root["bufferViews"]) - 1, "componentType": kind, "count": count, "type": "VEC4"}
+        primitive["attributes"][name] = len(root["accessors"])
+        root["accessors"].append(view)
+        binary += values.tobytes()
+    root["buffers"][0]["byteLength"] += len(binary) - at
+    root["nodes"] += [{"name": "Head", "children": [first + 1, first + 2]}, {"name": "LeftEye"}, {"name": "RightEye"}]
+    root["nodes"][0]["skin"], root["skins"] = 0, [{"joints": [first, first + 1, first + 2]}]
+    root["scenes"][0]["nodes"].append(first)
+    path.write_bytes(packed(root, binary))
+    (tmp_path / "page.glb").write_bytes(saved(run, {"glb": str(path), "rows": planted_rows().tolist()}, ".glb"))
+    played = Performance(np.arange(2.0), ("jawOpen",), np.zeros((2, 1), np.float32), np.full((2, 9), 0.1))
+    (tmp_path / "python.glb").write_bytes(performed_glb(read_document(path), played))
+    turned = {"Head", "RightEye"} | ({"LeftEye"} if bone == "Head" else set())
+    for name in ("page.glb", "python.glb"):
+        assert {node for node, way in animated(tmp_path / name) if way == "rotation"} == turned, name
 
 
 def edited(data: bytes, path: Path, edit: Callable[[dict[str, Any]], None]) -> Path:

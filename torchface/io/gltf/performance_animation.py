@@ -9,15 +9,18 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.character_nodes import character_nodes, looks_back
 from torchface.io.gltf.gltf_document import Document, glb_pieces
 from torchface.io.gltf.primitive_reading import read_target_names
+from torchface.io.gltf.rest_of_skin import blended
 from torchface.io.gltf.scene import instances, local_transform, node_transforms
 from torchface.shape_names import read_as_arkit
 
 NECKS_SHARE = 0.3  # of the head's rotation, where there is a neck
 
+_BOUND, _LEAST = 0.5, 0.05  # of an eye's vertices to its bone; of a shape's largest motion, that an eye looks by it
 _PIVOT = (0.0, -0.25, -0.1)  # of the shapes' box from its middle: where a head without bones turns
 
 
@@ -134,18 +137,26 @@ def _without_matrix(document: Document, root: dict[str, Any], node: int) -> None
 
 
 def _looks_by_shapes(document: Document, node: int) -> bool:
-    """Whether an eye is moved by looking shapes of its own, so that turning it would move it twice."""
+    """Whether an eye is moved by looking shapes, of its own mesh or of one whose skin binds it to the node, so that
+    turning it would move it twice."""
     nodes = document.objects("nodes")
-    for one in (node, *document.array(nodes[node], "children", f"nodes[{node}]")):
-        mesh = nodes[one].get("mesh")
-        if mesh is None:
+    own = (node, *document.array(nodes[node], "children", f"nodes[{node}]"))
+    for index, one in enumerate(nodes):
+        if (mesh := one.get("mesh")) is None:
+            continue
+        skin = {} if one.get("skin") is None else document.item("skins", one["skin"], "skin")
+        joints = np.array(document.array(skin, "joints", "skins")) == node
+        if index not in own and not joints.any():
             continue
         names = read_as_arkit(read_target_names(document, mesh))
         for primitive in document.array(document.objects("meshes")[mesh], "primitives", "mesh"):
             for name, target in zip(names, primitive.get("targets", []), strict=False):
-                accessor = document.item("accessors", target.get("POSITION"), "targets")
-                bounds = [*accessor.get("min", [1.0]), *accessor.get("max", [1.0])]
-                if name.lower().startswith("eyelook") and any(abs(value) > 0 for value in bounds):
+                if not name.lower().startswith("eyelook") or "POSITION" not in target:
+                    continue
+                moved = np.abs(read_floats(document, target["POSITION"], "targets", ("VEC3",))).max(1)
+                attributes = primitive["attributes"]
+                bound = index in own or blended(document, joints, attributes, "mesh", len(moved)) > _BOUND
+                if (moved * bound).max(initial=0.0) > _LEAST * moved.max(initial=0.0):
                     return True
     return False
 
