@@ -210,7 +210,8 @@ def test_the_metadata_says_what_goes_in_and_out(written: VideoReport, rig: Blend
 
 
 @pytest.mark.bench
-def test_without_a_face_nothing_begins(written: VideoReport, rig: BlendshapeRig) -> None:
+@pytest.mark.parametrize("kind", ["few", "zeros", "a place", "a line"])
+def test_without_a_face_nothing_begins(written: VideoReport, rig: BlendshapeRig, kind: str) -> None:
     """Frames before the first face hand on no state; the file then begins as if they had not been."""
     session = onnxruntime.InferenceSession(written.path, providers=["CPUExecutionProvider"])
     names = [o.name for o in session.get_outputs()]
@@ -219,6 +220,10 @@ def test_without_a_face_nothing_begins(written: VideoReport, rig: BlendshapeRig)
     _, landmarks = synthetic_landmarks(VideoSolver(rig, None, K), 2, seed=3)
     empty = np.full((68, 2), np.nan, np.float32)
     empty[:5] = landmarks[0, :5].nan_to_num(100.0)
+    if kind != "few":
+        empty[:] = 0.0 if kind == "zeros" else 123.0
+    if kind == "a line":
+        empty[:, 0] += np.arange(68)
     first = dict(zip(names, session.run(names, {"landmarks": empty, "confidence": trust, **none}), strict=True))
     assert np.isnan(first["rotation"]).all()
     assert (first["weights"] == 0).all()
