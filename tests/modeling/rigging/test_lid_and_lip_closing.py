@@ -162,14 +162,24 @@ def test_lips_that_are_apart_at_rest_stay_apart() -> None:
     actor = performer(texture=False).select(["mouthFrownLeft", "mouthPucker", "jawOpen"])
     apart = actor.neutral.with_vertices(actor.vertices + 0.2 * actor.deltas[2])
     moved = transfer_with_report(actor, apart).rig
-    upper, lower = actor.neutral.landmarks[[62, 66]]
-
-    def gap(vertices: Tensor) -> float:
-        return float(vertices[upper, 1] - vertices[lower, 1])
-
-    assert gap(apart.vertices) > 4
+    assert lip_gap(apart) > 4
     for shape in moved.deltas[:2]:
-        assert gap(apart.vertices + shape) > 0.8 * gap(apart.vertices)
+        assert lip_gap(apart.with_vertices(apart.vertices + shape)) > 0.8 * lip_gap(apart)
+
+
+def test_lips_a_little_further_apart_at_rest_press_like_the_templates() -> None:
+    actor = performer(texture=False).select(["mouthFrownLeft", "jawOpen"])
+    apart = actor.neutral.with_vertices(actor.vertices + 0.01 * actor.deltas[1])
+    frown = transfer_with_report(actor, apart).rig.deltas[0]
+    assert lip_gap(apart) > lip_gap(actor.neutral) + 0.2
+    found, expected = apart.vertices + frown, actor.vertices + actor.deltas[0]
+    assert abs(lip_gap(apart.with_vertices(found)) - lip_gap(apart.with_vertices(expected))) < 0.05
+
+
+def lip_gap(mesh: Mesh) -> float:
+    assert mesh.landmarks is not None
+    upper, lower = mesh.landmarks[[62, 66]]
+    return float(mesh.vertices[upper, 1] - mesh.vertices[lower, 1])
 
 
 @pytest.mark.real

@@ -33,7 +33,7 @@ STILL = 0.01
 _LINK_WEIGHT = 100.0
 _LINK_TOLERANCE = 0.02
 _CONTACT_DECAY = 4.0
-_TOUCHING = 0.3  # millimetres between lips that touch at rest
+_TOUCHING = 0.3  # millimetres between lips that touch at rest, and by which they close at most
 _NEAREST = 16  # vertices
 
 
@@ -240,11 +240,12 @@ class _ClosedGaps:
     def extra(self, rows: Tensor, change: Tensor) -> Tensor:
         """How much more the target has to close, (K,3), by the share of the source's gap that a change closes.
 
-        Lips that touch at rest close nothing, however they press: the target's stay as far apart as they are at rest.
+        Where lips touch at rest the target's close by a little at most, however they press: lips apart stay apart.
         """
         closed = ((change * self.source_across[rows]).sum(-1) / self.gap[rows].clamp(min=_TOUCHING)).clamp(0, 1)
-        closed[self.gap[rows] < _TOUCHING] = 0.0
-        return self.target_across[rows] * (closed * self.wider[rows])[:, None]
+        wider = self.wider[rows]
+        wider = torch.where(self.gap[rows] < _TOUCHING, wider.clamp(max=_TOUCHING), wider)
+        return self.target_across[rows] * (closed * wider)[:, None]
 
 
 def _closed_gaps(rest: Tensor, goal: Tensor, faces: Tensor, pairs: Tensor) -> _ClosedGaps:
