@@ -226,6 +226,7 @@ def test_without_a_face_nothing_begins(written: VideoReport, rig: BlendshapeRig,
         empty[:, 0] += np.arange(68)
     first = dict(zip(names, session.run(names, {"landmarks": empty, "confidence": trust, **none}), strict=True))
     assert np.isnan(first["rotation"]).all()
+    assert np.isnan(first["translation"]).all()
     assert (first["weights"] == 0).all()
     handed = {name: first[name[9:]] for name in none}
     marks = {"landmarks": landmarks[1].numpy(), "confidence": trust}

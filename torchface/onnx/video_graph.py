@@ -166,7 +166,7 @@ class VideoGraph(nn.Module):
         out = [
             torch.where(started, head.weights[0], 0.0),
             torch.where(started, head.rotation[0], torch.nan),
-            head.translation[0],
+            torch.where(started, head.translation[0], torch.nan),
         ]
         if self.walks:
             out.append(torch.where(started, hidden[0], torch.nan))
