@@ -10,7 +10,6 @@ from torchface.landmarks.images.boxes.face_box import FaceBoxes, FaceDetector, a
 from torchface.landmarks.images.checked_detector import CheckedDetector, shipped_detector
 from torchface.landmarks.images.face_reading import FaceReading
 from torchface.landmarks.images.find_faces import find_faces
-from torchface.landmarks.images.frame_reader.face_place import place_around
 from torchface.landmarks.images.ibug_68 import turned_box
 from torchface.landmarks.images.landmark_finder import LandmarkFinder, find_in_box
 from torchface.landmarks.images.person_identity import (
@@ -182,8 +181,9 @@ class LandmarkTracker:
 
     def _is_person(self, frame: Tensor, face: FaceReading) -> bool:
         """Whether a face is the followed person's, and not somebody's who passes before them; notes whose it is."""
-        people, around = self._followed.people, place_around(face.landmarks)
-        look = look_at(frame, self._place(face.landmarks), LOOK_SIZE)
+        people, place = self._followed.people, self._place(face.landmarks)
+        around = torch.cat([place[:2] + place[2:4] / 2, place[2:3], place[4:].cos(), place[4:].sin()])
+        look = look_at(frame, place, LOOK_SIZE)
         other = is_other(people, around, look, self._interval)
         self._followed.people = after_face(people, around, look, (~other, other), self._interval)
         return not bool(other)
