@@ -100,14 +100,14 @@ class VideoFile:
         Raises:
             FileFormatError: frames change their size on the way, or come at a variable rate where it must be ``even``.
         """
-        packets = read_packets(self.path)
         if self.even:
-            check_even_rate(self.path, packets.seconds, self.fps)
+            check_even_rate(self.path, read_packets(self.path).seconds, self.fps)
         first: tuple[int, int] | None = None
         for seconds, width, height in key_frame_sizes(self.path):
             first = first or (width, height)
             if (width, height) != first:
-                raise self._resized(int((packets.seconds < seconds).sum()), width, height, *first)
+                number = int((read_packets(self.path).seconds < seconds).sum())
+                raise self._resized(number, width, height, *first)
 
     def chunks(self, frames: int = 64) -> Iterator[Tensor]:
         """The frames as uint8 tensors (t,H,W), up to ``frames`` at a time: fewer where they take more than 32 MiB.
