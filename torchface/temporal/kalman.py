@@ -83,11 +83,14 @@ class KalmanFilter:
             raise ValueRangeError("Kalman filter: found settings of different damping, expected one for all channels")
         self._damping = each[0].damping
         # Channels of the same settings that were seen in the same frames have the same covariance: it is kept once.
-        kinds = list(dict.fromkeys(each))
+        first: dict[KalmanSettings, int] = {}
+        for channel, kind in enumerate(each):
+            first.setdefault(kind, channel)
+        kinds = list(first)
         row = {kind: number for number, kind in enumerate(kinds)}
         self.group = torch.tensor([row[one] for one in each]).expand(channels)
         """Which row of what is kept by group each channel has, (C,)."""
-        self._first = torch.tensor([each.index(kind) for kind in kinds])
+        self._first = torch.tensor(list(first.values()))
         self.variance = torch.tensor([kind.measurement**2 for kind in kinds], dtype=torch.float64)
         """Of the measurements, (G,)."""
         self.covariance = torch.zeros(len(kinds), 3, 3, dtype=torch.float64)

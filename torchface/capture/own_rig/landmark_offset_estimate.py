@@ -249,8 +249,8 @@ def _mean_problem(solver: VideoSolver, take: _Take, start: HeadState, likely: Te
     # A residual of 1 is the frames' noise, in millimetres on the head:
     unit = float((noise * head.translation[:, 2]).median() / K[0, 0])
     factor = (unit / _MODEL_ERROR) ** 2
-    H = factor * torch.einsum("t,tij,tik->jk", share, left, by_both)
-    gradient = factor * torch.einsum("t,tij,ti->j", share, left, rest)
+    shared = factor * (share[:, None, None] * left).flatten(0, 1).T
+    H, gradient = shared @ by_both.flatten(0, 1), shared @ rest.flatten()
     read = None
     if terms.read is not None:
         H_read = LASTING * torch.einsum("t,tij->ij", share, terms.read.H)
