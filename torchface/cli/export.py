@@ -202,9 +202,9 @@ def webcam(out: OutputPath, quiet: Quiet = False) -> None:
     Inputs of the graph: `image`, uint8 (rows, columns, 3 or 4 channels), red first, `interval`, seconds since the
     picture before, `controls` (5,), and `state`, zeros to start. Outputs: `weights` (52,), `rotation` (3,3),
     `translation` (3,), millimetres, `gaze` (2,2), radians, `landmarks` (68,2) and `iris` (2,2), pixels, `presence`,
-    `calibrated`, and `next_state`, which the next picture takes. It finds the face, follows it and learns the person by
-    itself; the weights move any character with ARKit's shapes. What it is made of is in the file's metadata. ONNX
-    Runtime is compared with PyTorch over a rendered video.
+    `calibrated`, `beside` (2,), other people to the left and right, and `next_state`, which the next picture takes. It
+    finds the face, follows it and learns the person by itself; the weights move any character with ARKit's shapes. What
+    it is made of is in the file's metadata. ONNX Runtime is compared with PyTorch over a rendered video.
 
     Args:
         out: The .onnx file to write.
