@@ -1,19 +1,27 @@
 """Eyeballs of rigs, and gaze that is seen as it was planted."""
 
+from pathlib import Path
+
+import pytest
 import torch
 
 from planted.seen_irises import irises
+from torchface import load_take
 from torchface.capture.own_rig.eye_geometry import (
     CORNERS,
     LOOKS,
     Eyeballs,
     gaze_of_looks,
     judged_openness,
+    lid_followers,
     look_weights,
+    openness_rows,
     seen_gaze,
     undrifted,
+    with_following_lids,
 )
 from torchface.geometry.rotations import rotation_matrix
+from torchface.shape_names import ARKIT, mapping
 from torchface.synthetic import performer
 
 
@@ -69,3 +77,43 @@ def test_hidden_and_shut_eyes() -> None:
     assert float(judged_openness(dim, torch.tensor([[0.3, 0.02]]).double(), sure)[0].diff().abs()) < 0.15
     assert float(judged_openness(dim, torch.tensor([[0.95, 0.02]]).double(), sure)[0].diff().abs()) > 0.75
     assert 0 < float(trust[0, 0]) < 0.5
+
+
+def test_lids_follow_eyes_that_look_up_and_leave_them_as_open() -> None:
+    rig = performer(texture=False)
+    names, landmarks = list(rig.names), rig.neutral.landmarks
+    weights = torch.zeros(3, len(names))
+    up, blink = names.index("eyeLookUpLeft"), names.index("eyeBlinkLeft")
+    weights[:, up] = 0.8
+    weights[1, blink] = 0.1
+    weights[2, blink] = 0.6  # a blink
+    lids = with_following_lids(weights, lid_followers(names)) - weights
+    wide, squint = (lids[:, names.index(f"eye{name}Left")] for name in ("Wide", "Squint"))
+    assert wide[0] > wide[1] > wide[2] == 0
+    assert torch.equal(wide, squint)
+    assert float(lids.sum()) == pytest.approx(float(wide.sum() + squint.sum()))  # no other shape, nor the other eye
+    opened, _ = openness_rows(rig.vertices[landmarks], rig.deltas[:, landmarks].permute(1, 2, 0), names)
+    assert float((opened @ lids[0]).abs().max()) < 0.02
+    assert float(opened[1, names.index("eyeWideLeft")] * wide[0]) > 0.04
+
+
+def test_a_rig_that_lacks_a_lid_is_left_alone() -> None:
+    names = ["eyeLookUpLeft", "eyeSquintLeft", "eyeBlinkLeft"]
+    weights = torch.tensor([0.5, 0.1, 0.0])
+    assert torch.equal(with_following_lids(weights, lid_followers(names)), weights)
+
+
+@pytest.mark.real
+def test_lids_of_people_follow_by_more_than_what_is_added(performances: list[Path]) -> None:
+    """A network reads a part of it, so what is added is near the least of six takes."""
+    slopes = []
+    for path in performances:
+        track = load_take(path).weights
+        weights = track.values[..., 0].double() @ mapping(track.names, ARKIT).double().T
+        look, *lids = (weights[:, ARKIT.index(f"eye{name}Left")] for name in ("LookUp", "Wide", "Squint"))
+        look = look - look.mean()
+        slopes.append([float((look @ (lid - lid.mean())) / (look @ look)) for lid in lids])
+    added = with_following_lids(torch.eye(52)[ARKIT.index("eyeLookUpLeft")], lid_followers(ARKIT))
+    for lid, found in zip(("Wide", "Squint"), torch.tensor(slopes).T, strict=True):
+        assert float(found.median()) > float(added[ARKIT.index(f"eye{lid}Left")]) > 0.2
+        assert float(found.min()) > 0.15

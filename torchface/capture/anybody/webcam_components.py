@@ -11,7 +11,7 @@ from torchface.capture.antagonist_shapes import signed_quantities
 from torchface.capture.anybody.guided_gains import gain_groups
 from torchface.capture.anybody.person_landmarks import PersonLandmarks
 from torchface.capture.anybody.webcam_state import StateLayout, WebcamState
-from torchface.capture.own_rig.eye_geometry import LOOKS, arkit_names, openness_rows
+from torchface.capture.own_rig.eye_geometry import LOOKS, arkit_names, lid_followers, openness_rows
 from torchface.capture.own_rig.face_points import JAW, LANDMARKS
 from torchface.capture.own_rig.weight_walk import twins_of
 from torchface.capture.priors import ShapePrior
@@ -89,6 +89,7 @@ _CONSTANTS = (
     "signed",
     "twins",
     "arkit_signed",
+    "followers",
     "landmark_weights",
     "camera",
     "look_eyes",
@@ -111,6 +112,7 @@ class WebcamSolverParts(nn.Module):
     signed: Tensor
     twins: Tensor
     arkit_signed: Tensor
+    followers: Tensor
     walk: Tensor
     landmark_weights: Tensor
     camera: Tensor
@@ -155,6 +157,8 @@ class WebcamSolverParts(nn.Module):
             "signed": signed_quantities(rig.names),
             "twins": twins_of(rig.names),
             "arkit_signed": signed_quantities(ARKIT),
+            # A prior has what goes together.
+            "followers": float(prior is None) * (lid_followers(rig.names).double() @ to_arkit.T),
             "walk": torch.tensor([(_LID_MOTION if n.startswith(_LIDS) else 1.0) for n in called]),
             "landmark_weights": landmark_weights,
             "camera": torch.eye(3),

@@ -8,6 +8,7 @@ from torch import Tensor
 from torchface.capture.antagonist_shapes import signed_difference
 from torchface.capture.anybody.guided_gains import gain_factors
 from torchface.capture.anybody.webcam_state import WebcamState
+from torchface.capture.own_rig.eye_geometry import with_following_lids
 from torchface.geometry.rotations import rotation_matrix
 from torchface.temporal.one_euro import WEBCAM_ONE_EURO, one_euro_step
 
@@ -25,6 +26,7 @@ class OutputTables:
     to_arkit: Tensor  # from the rig's weights to ARKit's, (52,N)
     filter_units: Tensor  # what counts as one in the filter, of weights, radians and millimetres, (58,)
     signed: Tensor  # of ARKit's antagonists, see `signed_quantities`, (K,52)
+    followers: Tensor  # see `lid_followers`, (3,2,52)
 
 
 def lost_state(before: WebcamState, interval: Tensor) -> WebcamState:
@@ -58,6 +60,7 @@ def calmed_state(
     """The state with its outputs: weights by ARKit's names with gains, calmed."""
     gains = gain_factors(after.gains, outputs.gain_shapes)
     weights = (gain * (outputs.to_arkit @ (after.shapes / gains))).clamp(0, 1)
+    weights = with_following_lids(weights, outputs.followers)
     pose = after.pose
     first = (before.pose.abs().sum() < 1e-9) | (after.shown < 1.5 * interval)
     turned = pose[:9].reshape(3, 3)

@@ -190,7 +190,7 @@ class WebcamSolver(WebcamSolverParts):
             (freeze <= 0).double(),
         )
         after = self._solved(frame, before).where(shows_face, lost_state(before, interval))
-        tables = OutputTables(self.gain_shapes, self.to_arkit, self.filter_units, self.arkit_signed)
+        tables = OutputTables(self.gain_shapes, self.to_arkit, self.filter_units, self.arkit_signed, self.followers)
         return calmed_state(tables, after, before, shows_face, present, interval, gain, smoothing).pack()
 
     def _solved(self, frame: _Frame, before: WebcamState) -> WebcamState:

@@ -176,8 +176,11 @@ def _add_stream(
     height, width = first.shape[-2:]
     lossless = container.format.name != "mp4"
     codec = "ffv1" if lossless else "libx264" if "libx264" in pyav().codecs_available else "mpeg4"
-    # With macroblock trees x264 does not always code the same frames into the same bytes.
-    options = {"preset": "superfast", "crf": str(crf), "x264-params": "mbtree=0"} if codec == "libx264" else {}
+    # With macroblock trees x264 does not always code the same frames into the same bytes; where to place B-frames need
+    # not be searched for: seven films became no larger, with the same errors, in nine tenths of the time.
+    options = {}
+    if codec == "libx264":
+        options = {"preset": "superfast", "crf": str(crf), "x264-params": "mbtree=0:b-adapt=0"}
     stream = cast("VideoStream", container.add_stream(codec, rate=_rate(fps, codec), options=options))
     stream.width, stream.height = width, height
     stream.codec_context.time_base = 1 / stream.codec_context.framerate if times is None else _TICK

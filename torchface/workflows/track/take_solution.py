@@ -11,7 +11,16 @@ from torch import Tensor
 from torchface.capture.antagonist_shapes import signed_difference, signed_quantities
 from torchface.capture.own_rig import FaceMeasurements, VideoSolution, VideoSolver
 from torchface.capture.own_rig.another_face import AnotherFace, other_faces
-from torchface.capture.own_rig.eye_geometry import CORNERS, LOOKS, Eyeballs, arkit_names, openness_rows, undrifted
+from torchface.capture.own_rig.eye_geometry import (
+    CORNERS,
+    LOOKS,
+    Eyeballs,
+    arkit_names,
+    lid_followers,
+    openness_rows,
+    undrifted,
+    with_following_lids,
+)
 from torchface.capture.own_rig.face_points import LANDMARKS
 from torchface.capture.own_rig.head_pose import measure_poses
 from torchface.capture.own_rig.landmark_offset_estimate import estimate_offsets
@@ -241,6 +250,8 @@ def new_solution(
     except ValueRangeError as error:
         raise ValueRangeError(f"{inputs.clip.path}: {error}") from error
     weights = calmed(solution.weights, solver.names, inputs.clip.fps)
+    if inputs.models.expects:  # else the prior says what goes together
+        weights = with_following_lids(weights, lid_followers(solver.names))
     return solver.solution(landmarks, trust, weights, solution.rotation, solution.translation, measured)
 
 
