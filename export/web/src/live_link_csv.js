@@ -27,7 +27,7 @@ export function liveLinkCsv(take) {
  */
 export function readLiveLinkCsv(text) {
   const [header, ...lines] = text.split(/\r?\n/).filter((line) => line.trim());
-  const names = (header ?? "").split(",").map((name) => name.trim());
+  const names = (header ?? "").replace(/[,\s]+$/, "").split(",").map((name) => name.trim());
   const column = new Map(names.map((name, i) => [name.toLowerCase(), i]));
   const shapes = names.flatMap((name, i) => sourcesOf(name).map(([row]) => [row, i]));
   const clock = column.get("timecode"), time = column.get("time");
@@ -35,14 +35,16 @@ export function readLiveLinkCsv(text) {
     throw new Error("this is no recording of ARKit's shapes. A .csv of Live Link Face or of torchface begins with Timecode or frame,time and their names.");
   const rows = lines.map((line) => line.split(","));
   const seconds = clock === undefined ? rows.map((row) => Number(row[time])) : clockSeconds(rows.map((row) => row[clock]));
-  const wrong = rows.findIndex((row, frame) => row.length < names.length || !Number.isFinite(seconds[frame]) || shapes.some(([, i]) => !Number.isFinite(Number(row[i]))));
-  if (wrong >= 0) throw new Error(`row ${wrong + 1} is cut short, or its time or a weight is no number.`);
+  const numbers = [...shapes.map(([, i]) => i), ...ROTATIONS.flatMap((name) => column.get(name.toLowerCase()) ?? [])];
+  const cut = (row) => row.length < names.length && row[column.get("blendshapecount")]?.trim() !== "0"; // of no face the app's are
+  const wrong = rows.findIndex((row, frame) => cut(row) || [seconds[frame], ...numbers.map((i) => row[i] ?? 0)].some((cell) => !Number.isFinite(Number(cell))));
+  if (wrong >= 0) throw new Error(`row ${wrong + 2} is cut short, or its time, a weight or an angle is no number.`);
   const take = new Take();
   rows.forEach((row, frame) => {
-    const number = (name) => Number(row[column.get(name.toLowerCase())] ?? 0) || 0;
+    const number = (name) => Number(row[column.get(name.toLowerCase())] ?? 0);
     const angles = (part) => ["Yaw", "Pitch", "Roll"].map((axis) => number(part + axis));
     const weights = new Float32Array(ARKIT.length);
-    for (const [shape, i] of shapes) weights[shape] = Math.min(1, Math.max(0, Number(row[i])));
+    for (const [shape, i] of shapes) weights[shape] = Math.min(1, Math.max(0, Number(row[i] ?? 0)));
     const [left, right] = [angles("LeftEye"), angles("RightEye")];
     const gaze = Float32Array.of(-right[0], -right[1], -left[0], -left[1]);
     take.add(1000 * seconds[frame], { weights, rotation: headRotation(angles("Head")), gaze });

@@ -173,6 +173,15 @@ def planted_rows(count: int = 5) -> np.ndarray:
     return np.column_stack(parts)
 
 
+def test_a_csv_of_the_app_has_short_rows_where_it_saw_no_face(run: Run, tmp_path: Path) -> None:
+    """And spreadsheets end rows in cells that have no name."""
+    clock = "00:00:00:0"
+    path = tmp_path / "take.csv"
+    path.write_text(f"Timecode,BlendshapeCount,JawOpen,,\n{clock}1,61,0.5\n{clock}2,0\n{clock}3,61,0.25,,\n")
+    rows = np.reshape(run("csv", path), (3, 66))
+    assert rows[:, 1 + ARKIT.index("jawOpen")].tolist() == [0.5, 0.0, 0.25]
+
+
 def test_a_take_comes_back_from_its_csv(run: Run, tmp_path: Path) -> None:
     rows, character = planted_rows(40), sheet(tmp_path / "sheet.glb", ("jawOpen",))
     (tmp_path / "take.csv").write_bytes(saved(run, {"glb": str(character), "rows": rows.tolist()}, ".csv"))
@@ -181,8 +190,8 @@ def test_a_take_comes_back_from_its_csv(run: Run, tmp_path: Path) -> None:
     save_weights_csv(take, tmp_path / "weights.csv")
     again = np.reshape(run("csv", tmp_path / "weights.csv"), rows.shape)
     np.testing.assert_allclose(again[:, :53], rows[:, :53], rtol=0, atol=2e-6)
-    start = "frame,time,jawOpen\n0,0,0.1\n"
-    broken = tuple(start + row for row in ("1,0.1\n", "1,x,0.2\n", "1,0.1,nan\n", "1,0.1,0.2x\n"))
+    start = "frame,time,jawOpen,HeadYaw\n0,0,0.1,0\n"
+    broken = tuple(start + row for row in ("1,0.1,0.2\n", "1,x,0.2,0\n", "1,0.1,nan,0\n", "1,0.1,0.2,0x\n"))
     for text in ("", "a,b\n1,2\n", "frame,time,antenna\n0,0,1\n", "Timecode,jawOpen\n", *broken):
         (tmp_path / "other.csv").write_text(text)
         assert isinstance(run("csv", tmp_path / "other.csv"), str), text
