@@ -25,6 +25,21 @@ def test_lips_are_drawn_in_the_texture() -> None:
     assert red > blue
 
 
+def test_a_tint_shows_on_a_texture_too() -> None:
+    head = performer(texture=False).neutral
+    painted = replace(head, texture=BLUE[:, None, None].expand(3, 8, 8).contiguous())
+    intrinsics = torch.tensor([[900.0, 0, 160], [0, 900, 160], [0, 0, 1]]).double()
+    flip = torch.diag(torch.tensor([1.0, -1.0, -1.0])).double()
+    nose = head.vertices[head.landmarks[30]].double()
+    camera = Camera(intrinsics, flip, torch.tensor([0.0, 0, 400]).double() - flip @ nose, 320, 320)
+    clay = QuickClay.of(painted, skin=True)
+    tints = [torch.full((len(head.vertices),), tint) for tint in (0.0, 0.67, 1.0)]
+    plain, half, full = (clay.draw(head.vertices, camera, tint) for tint in tints)
+    assert (plain == clay.draw(head.vertices, camera)).all()
+    redder = [int(image[160, 160, 0]) - int(image[160, 160, 2]) for image in (plain, half, full)]
+    assert redder[0] + 80 < redder[1] < redder[2] - 30
+
+
 def test_irises_have_the_colour_of_a_texture_that_shows_some() -> None:
     head = performer(texture=False).neutral
     intrinsics = torch.tensor([[3000.0, 0, 160], [0, 3000, 160], [0, 0, 1]]).double()

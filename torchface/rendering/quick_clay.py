@@ -16,7 +16,7 @@ from torchface.rendering.clay_shading import vertex_openness
 from torchface.rendering.part_colors import CLAY, clear_triangles, triangle_colors
 
 BACKGROUND = (38, 40, 44)
-_TINT = (236, 92, 40)
+_TINT, _TINT_SHARE = (236, 92, 40), 0.75
 _LIPS = (0.77, 0.52, 0.47)
 _LEVELS, _TINT_LEVELS = 256, 4
 _AMBIENT, _HIGHLIGHT = 0.16, 0.08
@@ -97,18 +97,20 @@ class QuickClay:
         index = row * _LEVELS + (light * (_LEVELS - 1)).clamp(0, _LEVELS - 1).long()
         colors = self.colors.take(index.numpy())
         if self.paint is not None:
-            self._paint_skin(colors, drawn, light)
+            self._paint_skin(colors, drawn, light, row)
         image[drawn.pixel.numpy()] = colors
         return _smooth_edges(_three(image.view(np.uint8).reshape(size)), drawn, row)
 
-    def _paint_skin(self, colors: np.ndarray, drawn: DrawnPixels, light: Tensor) -> None:
-        """Overwrites colours (S,) of what is no part with the texture's in the light (S,)."""
+    def _paint_skin(self, colors: np.ndarray, drawn: DrawnPixels, light: Tensor, kind: Tensor) -> None:
+        """Overwrites colours (S,) of what is no part with the texture's, with its tint, in the light (S,)."""
         assert self.paint is not None
         texture, corners = self.paint
-        mine = self.part[drawn.triangle] == 0
+        mine = kind < _TINT_LEVELS
         column, row = (drawn.interpolated(corners[..., axis])[mine].round().long() for axis in (0, 1))
         height, width = texture.shape[:2]
         texels = texture[row.clamp(0, height - 1), column.clamp(0, width - 1)]
+        if bool(kind[mine].any()):
+            texels = texels.lerp(texels.new_tensor(_TINT), _TINT_SHARE * kind[mine, None] / (_TINT_LEVELS - 1))
         colors[mine.numpy()] = _words((_EXPOSURE * light[mine, None] * texels).clamp(0, 255).byte().numpy())
 
     def _light(self, points: Tensor) -> Tensor:
@@ -157,7 +159,7 @@ def _with_iris(colors: Tensor, texture: Tensor, places: Tensor) -> Tensor:
 
 def _lit_colors(palette: np.ndarray) -> np.ndarray:
     """Colours (P,3) under every tint and light, one after the other, uint8."""
-    tint = np.linspace(0, 0.75, _TINT_LEVELS)[:, None]
+    tint = np.linspace(0, _TINT_SHARE, _TINT_LEVELS)[:, None]
     tinted = palette[:, None] * (1 - tint) + np.array(_TINT) * tint
     light = np.linspace(0, 1, _LEVELS)[:, None]
     return _words((tinted[:, :, None] * light).clip(0, 255).round().astype(np.uint8).reshape(-1, 3))
