@@ -66,6 +66,19 @@ def test_a_vrm_moves_by_what_its_expressions_say(dome_rig: BlendshapeRig, tmp_pa
     torch.testing.assert_close(load_character(path).weights(weights), expected)
 
 
+def test_broken_expressions_stop_no_vrm_whose_targets_have_names(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    broken = {"VRMC_vrm": {"expressions": {"preset": {"happy": {"morphTargetBinds": [{"node": 99, "index": 0}]}}}}}
+    for names in (["jawOpen", "m_1", "m_2", "m_3"], ["m_0", "m_1", "m_2", "m_3"]):
+        save_rig(BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names), tmp_path / "dome.glb")
+        path = tmp_path / "avatar.vrm"
+        rewrite(tmp_path / "dome.glb", lambda root: root.update(extensions=broken), path)
+        if names[0] == "jawOpen":
+            assert load_character(path).weights(torch.ones(1, 52)).tolist() == [[1, 0, 0, 0]]
+        else:
+            with pytest.raises(FileFormatError, match="happy"):
+                load_character(path)
+
+
 def test_characters_that_cannot_move(dome_rig: BlendshapeRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from torchface import save_mesh
 

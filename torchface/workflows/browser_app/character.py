@@ -184,7 +184,13 @@ def _by_expressions(document: Document, found: Mapping[str, RecognisedShape]) ->
     meshes = [read_target_names(document, i) for i in range(len(document.objects("meshes")))]
     known = {name for shape in found.values() for name in shape.names}
     sums: dict[str, dict[str, float]] = {}
-    for expression, binds in vrm_expressions(document).items():
+    try:
+        expressions = vrm_expressions(document)
+    except FileFormatError:
+        if not found:
+            raise
+        return sums  # a character that moves without them need not have them in order
+    for expression, binds in expressions.items():
         arkit = arkit_name(expression)
         if arkit is None or arkit not in ARKIT or arkit in found:
             continue
