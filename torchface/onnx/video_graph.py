@@ -23,11 +23,10 @@ from torchface.capture.own_rig.video_solver import VideoSolver
 from torchface.capture.own_rig.weight_walk import relative_trust, unseen_time
 from torchface.capture.priors import AdaptedDynamicsPrior, DynamicsPrior
 from torchface.errors import ShapeError, ValueRangeError
-from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
+from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal, spreads
 from torchface.optim.exported_operators import symmetric_inverse
 
 _MIN_LANDMARKS = 6
-_FLAT = 1e-6  # of the squared variance of landmarks, that of a line
 _SPLITTING_STEPS = 40
 
 
@@ -135,11 +134,7 @@ class VideoGraph(nn.Module):
         unseen = ~torch.isfinite(landmarks).all(1) | ~(confidence > 0)
         pixels = torch.where(unseen[:, None], 0.0, landmarks.double())
         trust = torch.where(unseen, 0.0, self.landmark_weights * confidence.double())
-        count = (~unseen).double().sum()
-        away = torch.where(unseen[:, None], 0.0, pixels - pixels.sum(0) / count.clamp(min=1.0))
-        a, b, _, c = (away.T @ away / count.clamp(min=1.0)).flatten()
-        # Landmarks in one place or on a line, as finders give that find none, are no face.
-        enough = (count > _MIN_LANDMARKS - 0.5) & (a * c - b * b > _FLAT * ((a + c).square() + 1.0))
+        enough = ((~unseen).double().sum() > _MIN_LANDMARKS - 0.5) & spreads(pixels, ~unseen)
         first = torch.isnan(state["rotation"]).any()
         rotation, translation = self._affine_pose(pixels, trust)
         rotation = torch.where(first, rotation, orthonormal(state["rotation"]))

@@ -267,6 +267,15 @@ def test_what_is_infinite_is_what_nobody_saw(solver: WebcamSolver, person: Tenso
     assert torch.equal(*both)
 
 
+def test_landmarks_in_one_place_or_on_a_line_are_no_face(solver: WebcamSolver, person: Tensor) -> None:
+    shown = seen(solver, person, weights_of(jawOpen=0.5), (0.0, 0.0, 0.0))
+    line = torch.stack([torch.arange(68.0), torch.arange(68.0) / 3 + 50], 1)
+    before = solver.step(solver.start(), shown, 1 / FPS)
+    lost = solver.step(before, NO_FACE, 1 / FPS).pack()
+    for marks in (torch.zeros(68, 2), torch.full((68, 2), 123.4), line):
+        assert torch.equal(solver.step(before, replace(shown, landmarks=marks), 1 / FPS).pack(), lost)
+
+
 def test_inputs_of_another_kind_or_shape_are_refused(solver: WebcamSolver) -> None:
     reading = [getattr(NO_FACE, name) for name in READ_FOR_SOLVER]
     rest = [torch.tensor([640.0, 480.0]), torch.tensor(0.1), WebcamControls().tensor(), solver.start().pack()]

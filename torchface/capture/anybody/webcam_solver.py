@@ -26,7 +26,7 @@ from torchface.capture.own_rig.weight_walk import (
 )
 from torchface.capture.weight_readings import doubted_blinks
 from torchface.errors import ShapeError
-from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal
+from torchface.geometry.cameras.affine_pose import affine_pose, orthonormal, spreads
 from torchface.geometry.cameras.calibration import ASSUMED_FIELD_OF_VIEW
 from torchface.landmarks.images.face_reading import LEAST_VISIBLE, READ_FOR_SOLVER, FaceReading, trust_of
 from torchface.number_checks import checked_type
@@ -176,7 +176,7 @@ class WebcamSolver(WebcamSolverParts):
         visible = ~torch.isnan(rays).any(1)
         present = _known(presence.double(), 0.0) * (visible.double().sum() >= LEAST_VISIBLE)
         trust = trust_of(self.landmark_weights * visible, _known(visibility.double(), 1.0).clamp(0, 1))
-        shows_face = (present > _PRESENT) & (trust.sum() > _LEAST_TRUST)
+        shows_face = (present > _PRESENT) & (trust.sum() > _LEAST_TRUST) & spreads(landmarks, visible)
         # Without a face all counts alike and what comes of it is dropped, so that no number is a NaN.
         frame = _Frame(
             torch.where(visible[:, None] & shows_face, rays, self.person.rest[:LANDMARKS, :2] * self.upright),

@@ -5,6 +5,8 @@ from torch import Tensor
 
 from torchface.optim.exported_operators import symmetric_inverse
 
+_FLAT = 1e-6  # of the squared variance of points, that of a line
+
 
 def affine_pose(points: Tensor, rays: Tensor, trust: Tensor) -> tuple[Tensor, Tensor]:
     """The pose, (3,3) and (3,) mm, in which an affine camera sees points (L,3), not in a plane, along rays (L,2).
@@ -25,3 +27,14 @@ def orthonormal(matrix: Tensor) -> Tensor:
     second = matrix[1] - (first @ matrix[1]) * first
     second = second / second.square().sum().sqrt()
     return torch.stack([first, second, torch.linalg.cross(first, second)])
+
+
+def spreads(points: Tensor, seen: Tensor) -> Tensor:
+    """Whether points (L,2), pixels, as far as they are seen, (L,), lie neither in one place nor on a line, () bool.
+
+    Finders give landmarks that do where they find no face.
+    """
+    count, points = seen.double().sum().clamp(min=1.0), torch.where(seen[:, None], points.double(), 0.0)
+    away = torch.where(seen[:, None], points - points.sum(0) / count, 0.0)
+    a, b, _, c = (away.T @ away / count).flatten()
+    return a * c - b * b > _FLAT * ((a + c).square() + 1.0)
