@@ -293,6 +293,21 @@ def test_landmarks_that_are_not_trusted_are_no_face(small: BlendshapeRig) -> Non
     torch.testing.assert_close(carried.weights, lost.weights)
 
 
+def test_landmarks_in_one_place_or_on_a_line_are_no_face(small: BlendshapeRig) -> None:
+    solver = exact(small)
+    landmarks = film(small, acted(5), *poses(5))
+    line = torch.stack([torch.arange(68.0), torch.arange(68.0) / 3 + 50], 1)
+    lost = landmarks.clone()
+    lost[2] = torch.nan
+    expected = solver(lost)
+    for marks in (torch.zeros(68, 2), torch.full((68, 2), 123.4), line):
+        lost[2] = marks
+        found = solver(lost)
+        assert found.solved.tolist() == [True, True, False, True, True]
+        for name in ("weights", "rotation", "translation"):
+            torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=0, atol=1e-6)
+
+
 def test_a_strong_prior_has_its_way(small: BlendshapeRig) -> None:
     """The more a prior counts, the closer to its peak; where it counts for nothing, it changes nothing."""
     samples = 0.3 + 0.02 * torch.randn(200, len(SEEN), generator=torch.Generator().manual_seed(0))

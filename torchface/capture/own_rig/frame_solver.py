@@ -22,6 +22,7 @@ from torchface.capture.own_rig.gauss_newton import (
 )
 from torchface.capture.own_rig.single_frame import SingleFrame
 from torchface.capture.own_rig.solver_components import VideoSolverParts
+from torchface.geometry.cameras.affine_pose import spreads
 from torchface.optim.implicit import attach_gradients
 
 _COARSEST, _FINEST = 1e-6, 1e-12  # residuals of a step's program
@@ -34,6 +35,7 @@ class FrameSolver(VideoSolverParts):
         """How much each of landmarks (B,68,2) counts beside one that is surely seen, by any camera, (B,68) float64."""
         seen = torch.isfinite(landmarks).all(-1).double()
         seen = seen if confidence is None else seen * confidence.detach().double().clamp(0, 1)
+        seen = seen * spreads(landmarks.detach(), seen > 0)[..., None]
         for view in views:
             seen = torch.maximum(seen, view.seen.to(seen))
         return seen

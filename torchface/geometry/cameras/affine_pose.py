@@ -30,11 +30,11 @@ def orthonormal(matrix: Tensor) -> Tensor:
 
 
 def spreads(points: Tensor, seen: Tensor) -> Tensor:
-    """Whether points (L,2), pixels, as far as they are seen, (L,), lie neither in one place nor on a line, () bool.
-
-    Finders give landmarks that do where they find no face.
+    """Whether points (...,L,2), pixels, as far as they are seen, (...,L) bool, lie neither in one place nor on a line,
+    (...) bool. Finders give landmarks that do where they find no face.
     """
-    count, points = seen.double().sum().clamp(min=1.0), torch.where(seen[:, None], points.double(), 0.0)
-    away = torch.where(seen[:, None], points - points.sum(0) / count, 0.0)
-    a, b, _, c = (away.T @ away / count).flatten()
+    seen = seen[..., None]
+    count, points = seen.double().sum(-2, keepdim=True).clamp(min=1.0), torch.where(seen, points.double(), 0.0)
+    away = torch.where(seen, points - points.sum(-2, keepdim=True) / count, 0.0)
+    a, b, _, c = (away.mT @ away / count).flatten(-2).unbind(-1)
     return a * c - b * b > _FLAT * ((a + c).square() + 1.0)
