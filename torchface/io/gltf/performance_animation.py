@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.buffers import BufferWriter
 from torchface.io.gltf.character_nodes import character_nodes, looks_back
+from torchface.io.gltf.draco_primitives import unpack_draco
 from torchface.io.gltf.gltf_document import Document, glb_pieces
 from torchface.io.gltf.primitive_reading import read_target_names
 from torchface.io.gltf.rest_of_skin import blended
@@ -150,6 +151,7 @@ def _looks_by_shapes(document: Document, node: int) -> bool:
             continue
         names = read_as_arkit(read_target_names(document, mesh))
         for primitive in document.array(document.objects("meshes")[mesh], "primitives", "mesh"):
+            unpack_draco(document, primitive, "mesh")
             for name, target in zip(names, primitive.get("targets", []), strict=False):
                 if not name.lower().startswith("eyelook") or "POSITION" not in target:
                     continue
