@@ -13,7 +13,7 @@ from planted_faces import Endless, ShadeSolver, a_session
 
 from torchface import load_rig, load_take
 from torchface.capture.anybody import WebcamControls
-from torchface.errors import FileFormatError, ValueRangeError
+from torchface.errors import FileFormatError, MissingExtraError, ValueRangeError
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.video import open_video
 from torchface.io.video.video_packets import pyav
@@ -244,6 +244,23 @@ def test_an_animation_that_finds_no_room_leaves_the_take(
     assert [take.frames for take in kept_takes(tmp_path / "out")] == [9]
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["files"] == ["weights.csv", "live_link.csv"]
     assert len(take_file(tmp_path / "out", "first")) == 9 * 66 * 4
+
+
+def test_a_character_whose_animation_cannot_be_made_leaves_the_take(
+    dome: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object) -> bytes:
+        raise MissingExtraError("dome.glb: Draco compression needs DracoPy")
+
+    monkeypatch.setattr(recordings_module, "performed_glb", broken)
+    session, recordings = a_session(Endless(9), tmp_path / "out", dome, [])
+    session.record(True)
+    session.run()
+    session.record(False)
+    (saved,) = recordings.finish()
+    missing = "without animation.glb: dome.glb: Draco compression needs DracoPy"
+    assert (saved.frames, saved.error, saved.note) == (9, "", missing)
+    assert len(load_take(tmp_path / "out" / "weights.csv")) == 9
 
 
 def test_memory_does_not_grow_with_the_frames(dome: Path, tmp_path: Path) -> None:

@@ -282,17 +282,17 @@ class Recordings:
         names, targets = self._character.targets(driven)
         turns = np.stack([take.extras["columns"][name].numpy() for name in ROTATIONS], 1)
         performance = Performance(take.times.numpy(), names, targets.numpy(), turns, take.fps)
-        animation, missing = performed_glb(self._character.document, performance), ""
+        missing = ""
         for files in ([WEIGHTS, LIVE_LINK, ANIMATION], [WEIGHTS, LIVE_LINK]):
             try:
                 with all_or_none():
                     save_weights_csv(moved, folder / WEIGHTS)
                     save_live_link(take, folder / LIVE_LINK)
                     if ANIMATION in files:
-                        write_file(folder / ANIMATION, animation)
+                        write_file(folder / ANIMATION, performed_glb(self._character.document, performance))
                     write_file(folder / SUMMARY, json.dumps({**summary, "files": files, **more}, indent=1).encode())
                 break
-            except FileFormatError as error:  # on a full disk the performance may go without its largest file
+            except TorchfaceError as error:  # on a full disk, or of a broken character, a take goes without animation
                 if ANIMATION not in files:
                     raise
                 missing = f"without {ANIMATION}: {error}"
