@@ -251,7 +251,8 @@ def new_solution(
         raise ValueRangeError(f"{inputs.clip.path}: {error}") from error
     weights = calmed(solution.weights, solver.names, inputs.clip.fps)
     if inputs.models.expects:  # else the prior says what goes together
-        weights = with_following_lids(weights, lid_followers(solver.names))
+        following = with_following_lids(weights, lid_followers(solver.names))
+        weights = signed_difference(following, signed_quantities(solver.names))  # lids that rise take back a blink
     return solver.solution(landmarks, trust, weights, solution.rotation, solution.translation, measured)
 
 
