@@ -122,20 +122,34 @@ def test_another_performers_eyeballs_are_found_from_the_lids() -> None:
         assert float((sphere_error / found_radius[parts.group] - own_error / template_radius[parts.group]).std()) < 5e-3
 
 
+def with_bulge(rig: BlendshapeRig, bulge: float) -> BlendshapeRig:
+    """The rig with a left eyeball that stands out by so many millimetres round the pupil."""
+    ball = rig.neutral.annotations.regions["eyeball_left"]
+    vertices, deltas, count = rig.vertices.double(), rig.deltas.double(), len(rig.names)
+    eye = vertices[ball]
+    centre = (eye.amax(0) + eye.amin(0)) / 2
+    ways = torch.nn.functional.normalize(eye - centre, dim=-1)
+    vertices[ball] = eye + bulge * ((ways[:, 2:] - 0.85) / 0.15).clamp(0, 1) * ways
+    turn = similarity_transform(eye.expand(count, -1, -1), eye + deltas[:, ball], scale=False)
+    deltas[:, ball] = turn.apply(vertices[ball].expand(count, -1, -1)) - vertices[ball]
+    return BlendshapeRig(rig.neutral.with_vertices(vertices.float()), deltas.float(), rig.names)
+
+
+def test_what_a_blink_meets_with_other_shapes_bends_it_little() -> None:
+    """It is in most mixtures: shared evenly, their demands moved its lids by 2.1 mm, in a point before the pupil."""
+    rig = performer(texture=False)
+    own = with_bulge(rig.select([n for n in rig.names if n.startswith("eye") and n.endswith("Left")]), 3.0)
+    parts, blink = inner_parts(own), own.names.index("eyeBlinkLeft")
+    alone = clear_parts(own, parts, torch.eye(len(own.names)))
+    bent = (clear_parts(own, parts).deltas - alone.deltas)[blink]
+    assert float(bent.norm(dim=-1).max()) < 1.2
+
+
 @pytest.mark.parametrize("strange", [False, True])
 def test_lids_stay_before_an_eye_with_a_bulge_whichever_way_it_looks(strange: bool) -> None:
     names = ["eyeBlinkLeft", "eyeLookUpLeft", "eyeLookDownLeft", "eyeWideLeft"]
     rig = performer(texture=False).select(names)
-    rig = caricature(rig, rig.vertices[rig.neutral.landmarks], eyes=0.5) if strange else rig
-    ball = rig.neutral.annotations.regions["eyeball_left"]
-    vertices, deltas = rig.vertices.double(), rig.deltas.double()
-    eye = vertices[ball]
-    centre = (eye.amax(0) + eye.amin(0)) / 2
-    ways = torch.nn.functional.normalize(eye - centre, dim=-1)
-    vertices[ball] = eye + 5.0 * ((ways[:, 2:] - 0.85) / 0.15).clamp(0, 1) * ways  # millimetres, round the pupil
-    turn = similarity_transform(eye.expand(4, -1, -1), eye + deltas[:, ball], scale=False)
-    deltas[:, ball] = turn.apply(vertices[ball].expand(4, -1, -1)) - vertices[ball]
-    own = BlendshapeRig(rig.neutral.with_vertices(vertices.float()), deltas.float(), names)
+    own = with_bulge(caricature(rig, rig.vertices[rig.neutral.landmarks], eyes=0.5) if strange else rig, 5.0)
     parts = inner_parts(own)
 
     def deepest(one: BlendshapeRig) -> Tensor:

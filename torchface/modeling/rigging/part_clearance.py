@@ -16,7 +16,7 @@ _BONE_MARGIN, _SHELL_MARGIN = 0.15, 0.5
 _ALLOWED = 0.1
 _MAX_ITERATIONS = 6
 _MAX_STEP = 2.0
-_SHELL_REACH, _SKIN_REACH = 2.0, 4.0
+_SHELL_REACH, _SKIN_REACH = 2.0, 8.0
 _STILL = 0.01
 _LIFTED, _MAX_DEPTH = 0.3, 3.0
 _MIXED_POSES, _MIXED, _MIN_WEIGHT, _MAX_WEIGHT = 32, 3, 0.3, 0.9
@@ -28,9 +28,10 @@ def clear_parts(rig: BlendshapeRig, parts: InnerParts, poses: Tensor | None = No
 
     What has come through goes back along the line to the middle of its group: a shell of the eye moves itself, with
     its neighbourhood, and also leaves the slot between lids that close; before teeth, gums and eyeballs, which are
-    hard, the skin moves out. What a pose asks for is shared by its shapes according to their weights. Vertices that a
-    shape leaves still stay still in it, and shapes in which nothing comes through keep their deltas bit by bit. Lips
-    that close over an open jaw (``mouthClose``) are tested there and not by themselves.
+    hard, the skin moves out. What a pose asks for is shared by its shapes according to their weights; one that is in
+    many poses, a blink, takes less, else the demands of all would bend it. Vertices that a shape leaves still stay
+    still in it, and shapes in which nothing comes through keep their deltas bit by bit. Lips that close over an open
+    jaw (``mouthClose``) are tested there and not by themselves.
 
     Args:
         rig: N shapes, V vertices.
@@ -75,7 +76,7 @@ def _cleared(deltas: Tensor, moving: Tensor, poses: Tensor, clearance: "Clearanc
 
     ``under`` are the rows of shapes that stand on another's pose, and that other's.
     """
-    changed = torch.zeros(len(deltas), dtype=torch.bool)
+    changed, often = torch.zeros(len(deltas), dtype=torch.bool), (poses != 0).sum(0).clamp(min=1)
     for weights in poses:  # each pose builds on the changes of the one before
         active = weights.nonzero()[:, 0]
         pose = clearance.rest + torch.tensordot(weights[active], deltas[active], dims=1)
@@ -85,8 +86,8 @@ def _cleared(deltas: Tensor, moving: Tensor, poses: Tensor, clearance: "Clearanc
         ids = step.abs().amax(1).nonzero()[:, 0]
         if len(ids) == 0:
             continue
-        part = weights[active, None] * moving[active][:, ids]
-        share = part / part.square().sum(0).clamp(min=1e-9)
+        part = (weights / often.square())[active, None] * moving[active][:, ids]
+        share = part / (weights[active] @ part).clamp(min=1e-9)
         deltas[active[:, None], ids] += share[..., None] * step[ids]
         changed[active] |= part.any(1)
     return changed
@@ -180,10 +181,10 @@ class Clearance:
 
 
 def _spread(points: Tensor, at: Tensor, steps: Tensor, reach: float) -> Tensor:
-    """What steps (K,3) at some places (K,3) mean for points (n,3): that of the nearest place, less with distance."""
-    distance, nearest = torch.cdist(points, at).min(1)
-    share = torch.exp(-((distance / reach) ** 2))
-    return torch.where(share > 0.01, share, 0.0)[:, None] * steps[nearest]
+    """What steps (K,3) at some places (K,3) mean for points (n,3): the mean of those near, less with distance."""
+    share = torch.exp(-((torch.cdist(points, at) / reach) ** 2))
+    most = share.amax(1, keepdim=True)
+    return torch.where(most > 0.01, most, 0.0) * (share @ steps) / share.sum(1, keepdim=True).clamp(min=1e-9)
 
 
 @dataclass(frozen=True)
