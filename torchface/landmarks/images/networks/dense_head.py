@@ -150,7 +150,7 @@ def _sampled(features: Tensor, pixels: Tensor, size: int) -> Tensor:
     right, down = ((one - low)[..., None] for one, low in zip(inside, (x, y), strict=True))
     # Rows of a table: ONNX Runtime samples a grid in five times the time.
     table = features.flatten(2).transpose(1, 2).flatten(0, 1)
-    first = x + width * y + (height * width) * torch.arange(len(features), device=x.device)[:, None]
+    first = x + width * y + (height * width) * torch.arange(features.shape[0], device=x.device)[:, None]
     a, b, c, d = (table[(first + beside).flatten()].unflatten(0, x.shape) for beside in (0, 1, width, width + 1))
     return torch.lerp(torch.lerp(a, b, right), torch.lerp(c, d, right), down)
 
