@@ -41,17 +41,6 @@ def test_a_frame_without_markers_keeps_the_weights_before(bumps: MarkerSolver) -
     torch.testing.assert_close(led[1], before[1], rtol=0, atol=0)
 
 
-def test_an_infinite_marker_is_one_that_is_not_seen(bumps: MarkerSolver) -> None:
-    lost = random_frames(bumps, 3)
-    lost[1, 4] = torch.nan
-    infinite, before = lost.clone(), torch.zeros(3, 10)
-    infinite[1, 4] = torch.tensor([5.0, -torch.inf, 5.0])
-    graph = SolverGraph(bumps)
-    assert torch.equal(graph(infinite, before), graph(lost, before))
-    graph = torch.export.export(graph, (lost, before), strict=False).module()
-    assert torch.equal(graph(infinite, before), graph(lost, before))
-
-
 def test_inputs_of_another_shape_are_refused(bumps: MarkerSolver) -> None:
     graph = SolverGraph(bumps)
     with pytest.raises(ShapeError, match=r"expected \(B,36,3\) and \(B,10\)"):
