@@ -1,5 +1,6 @@
 """Two people, another photograph's landmarks, a dark or a grey picture: none passes without a word."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
@@ -9,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from torchface import load_rig, zoo
+from torchface import Mesh, load_rig, zoo
 from torchface.errors import AlignmentError
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io import load_identity_modes, load_image, save_image
@@ -18,7 +19,7 @@ from torchface.modeling import FitSettings, HeadModel, ImageFit, MorphableModel,
 from torchface.progress import silent
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import draw_identities, performer
-from torchface.workflows.fit import fit_checks
+from torchface.workflows.fit import fit_checks, photograph_rig
 from torchface.workflows.fit.fit_checks import ALONE, one_person_lines
 from torchface.workflows.fit.fit_landmarks import landmarks_of
 from torchface.workflows.fit.photograph_rig import PhotographSettings, fit_photographs
@@ -59,6 +60,20 @@ def people(data: Path, ict_folder: Path, tmp_path_factory: pytest.TempPathFactor
     model = tmp_path_factory.mktemp("models") / "people"
     zoo.save_model(heads, model, zoo.ModelCard("MIT", "ICT", {}, "none"))
     return People(model, [data / "images" / "people" / name for name in PEOPLE], heads, rig)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def template_shapes() -> Iterator[None]:
+    """No test here looks at the shapes or the rig's file, which take half the time: the template's are not moved."""
+
+    def unmoved(rig: BlendshapeRig, mesh: Mesh, **_: object) -> SimpleNamespace:
+        report = SimpleNamespace(summary=lambda: "")
+        return SimpleNamespace(rig=BlendshapeRig(mesh, rig.deltas, rig.names), report=report)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(photograph_rig, "transfer_with_report", unmoved)
+        patch.setattr(photograph_rig, "save_rig", lambda *_: None)
+        yield
 
 
 @pytest.mark.bench
