@@ -50,7 +50,7 @@ class GroupClassifier(nn.Module):
 
     def magnitudes(self, images: Tensor) -> Tensor:
         """Of the Gabor filters, (B,D), of the group's regions (B,G,h,w), merged."""
-        return self.gabor(images.flatten(0, 1)).reshape(len(images), len(self.mean))
+        return self.gabor(images.flatten(0, 1)).reshape(images.shape[0], len(self.mean))
 
     def scores(self, images: Tensor, rest: Tensor) -> Tensor:
         """Of every class, (B,C), for regions (B,G,h,w) and the regions at rest (G,h,w)."""
