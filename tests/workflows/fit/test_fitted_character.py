@@ -1,6 +1,7 @@
 """Hair that hangs beside the neck is found in what photographs show, and what stands behind the head is none."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -90,6 +91,18 @@ def test_teeth_are_as_bright_as_photographed_and_grey_in_black_and_white(colors:
     assert "hair" not in made.regions
     covered = dressed_rig(actor, actor, photographed, [image], parts, torch.zeros(1, 68, 2), True, True).rig.neutral
     assert "hair" in covered.regions
+
+
+def test_a_head_with_a_rig_of_its_own_is_grey_in_black_and_white_also_in_the_mouth() -> None:
+    actor = performer().select(["jawOpen"])
+    parts = [FaceParts(torch.zeros(len(PARTS), SIZE, SIZE), torch.eye(2, 3, dtype=torch.float64))]
+    head = replace(actor.neutral, colors=torch.tensor([0.7, 0.4, 0.4]).repeat(len(actor.neutral.vertices), 1))
+    photographed = ImageFit(head, (), *torch.zeros(2, 1, 0), (), *torch.zeros(2, 1, 68, 2), 0.0, torch.zeros(0, 0))
+    for tint, grey in ((0.6, True), (0.4, False)):
+        image = torch.tensor([0.6, 0.6, tint])[:, None, None].repeat(1, SIZE, SIZE)
+        made = dressed_rig(actor, actor, photographed, [image], parts, torch.zeros(1, 68, 2), False).rig.neutral
+        assert bool((made.texture == made.texture[:1]).all()) == grey
+        assert bool((made.colors == made.colors[:, :1]).all()) == grey
 
 
 @pytest.mark.parametrize("scale", [0.85, 1.0])

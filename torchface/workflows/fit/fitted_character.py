@@ -58,7 +58,8 @@ def dressed_rig(
     neutral = with_template_skin(fit.mesh, template.neutral, unseen)
     if not whole:
         neutral = neutral if fit.iris is None else with_iris(neutral, fit.iris)
-        return DressedRig(BlendshapeRig(neutral, rig.deltas, rig.names))
+        own = BlendshapeRig(neutral, rig.deltas, rig.names)
+        return DressedRig(_grey(own) if without_colors(images) else own)
     usual, shirt = Look(), _cloth(images, parts)
     look = Look(
         hair=usual.hair if fit.hair is None else _color(fit.hair),
@@ -84,11 +85,13 @@ def iris_size(mesh: Mesh) -> float:
 
 
 def _grey(rig: BlendshapeRig) -> BlendshapeRig:
-    """A rig whose texture has no colours, as its photographs have none."""
-    skin = rig.neutral.texture
-    assert skin is not None
-    grey = skin[:3].mean(0, keepdim=True).expand_as(skin[:3])
-    return BlendshapeRig(replace(rig.neutral, texture=torch.cat([grey, skin[3:]])), rig.deltas, rig.names)
+    """A rig whose texture and colours have no hue, as its photographs have none."""
+    skin, colors = rig.neutral.texture, rig.neutral.colors
+    if skin is not None:
+        skin = torch.cat([skin[:3].mean(0, keepdim=True).expand_as(skin[:3]), skin[3:]])
+    if colors is not None:
+        colors = colors.mean(1, keepdim=True).expand_as(colors)
+    return BlendshapeRig(replace(rig.neutral, texture=skin, colors=colors), rig.deltas, rig.names)
 
 
 def _brightness(images: Sequence[Tensor], parts: Sequence[FaceParts]) -> dict[str, float]:
