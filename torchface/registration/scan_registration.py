@@ -243,8 +243,9 @@ def _final_notes(template: Mesh, scan: Mesh, deformer: Deformer, texture_size: i
     notes = []
     folded = int(deformer.folded_triangles().sum())
     if folded:
+        turned = "1 triangle of the result is" if folded == 1 else f"{folded} triangles of the result are"
         notes.append(
-            f"{folded} triangles of the result are turned over, as at holes, lids, lips and ears; correct landmarks "
+            f"{turned} turned over, as at holes, lids, lips and ears; correct landmarks "
             "there, or smooth them in a mesh editor"
         )
     if not has_colors(scan):

@@ -252,7 +252,8 @@ def new_solution(
     weights = calmed(solution.weights, solver.names, inputs.clip.fps)
     if inputs.models.expects:  # else the prior says what goes together
         following = with_following_lids(weights, lid_followers(solver.names))
-        weights = signed_difference(following, signed_quantities(solver.names))  # lids that rise take back a blink
+        signed = signed_quantities(solver.names).to(weights.device)
+        weights = signed_difference(following, signed)  # lids that rise take back a blink
     return solver.solution(landmarks, trust, weights, solution.rotation, solution.translation, measured)
 
 
