@@ -11,13 +11,14 @@ import numpy as np
 import pytest
 import torch
 from browser import posted
+from edited_characters import edited, sheet
 from osc_receiver import values_by_address
-from rig_samples import corrective_sheet, named_sheet, quad_sheet
+from rig_samples import corrective_sheet, quad_sheet
 from scipy.spatial.transform import Rotation
 from test_vrm_in_browser import browser as vrm_browser  # noqa: F401  (three-vrm's packages)
 
 from planted.characters import Planted, write_character
-from planted.glb_files import packed, rewrite, unpacked
+from planted.glb_files import packed, unpacked
 from torchface import load_rig, load_take, save_rig
 from torchface.io.gltf.accessors import read_floats
 from torchface.io.gltf.animation_reading import read_gltf_weights
@@ -33,11 +34,6 @@ from torchface.workflows.head_rotations import head_angles
 pytestmark = pytest.mark.browser
 VRM_WEB = Path(__file__).parents[2] / "io" / "vrm" / "web"
 Run = Callable[[str, object], Any]
-
-
-def sheet(path: Path, names: tuple[str, ...]) -> Path:
-    save_rig(named_sheet(names), path)
-    return path
 
 
 def test_a_character_takes_weights_by_name_and_turns_as_the_head_does(run: Run, tmp_path: Path) -> None:
@@ -320,29 +316,6 @@ def assert_posed(found: dict[str, Any], head: Rotation, expressions: dict[str, f
         assert found["shown"][name] == pytest.approx(value, abs=1e-3), name
 
 
-def test_arms_that_stand_off_hang_and_arms_that_hang_stay(run: Run, tmp_path: Path) -> None:
-    def with_arms(root: dict[str, Any]) -> None:
-        first = len(root["nodes"])
-        root["nodes"] += [
-            {"name": "LeftArm", "translation": [0.1, 0.0, 0.0], "children": [first + 1]},
-            {"name": "LeftForeArm", "translation": [0.3, 0.0, 0.0]},
-            {"name": "RightArm", "translation": [-0.1, 0.0, 0.0], "children": [first + 3]},
-            {"name": "RightForeArm", "translation": [-0.05, -0.3, 0.0]},
-        ]
-        root["skins"] = [{"joints": [*range(first, first + 4)]}]
-        root["scenes"][0]["nodes"] += [first, first + 2]
-
-    told = run("pose", edited(sheet(tmp_path / "a.glb", ("jawOpen",)).read_bytes(), tmp_path / "arms.glb", with_arms))
-    left, right = (
-        np.subtract(told["places"][f"{side}ForeArm"], told["places"][f"{side}Arm"]) for side in ("Left", "Right")
-    )
-    neck = Rotation.from_euler("Y", 0.3)  # the whole character turns, as it has no head
-    left, right = (neck.inv().apply(way) for way in (left, right))
-    assert left[1] / 0.3 < -0.95
-    assert left[0] > 0
-    np.testing.assert_allclose(right, [-0.05, -0.3, 0], atol=1e-6)
-
-
 def animated(path: Path) -> dict[tuple[str, str], np.ndarray]:
     """The keys of a file's first animation by the name of the node and what of it moves."""
     document = read_document(path)
@@ -352,19 +325,6 @@ def animated(path: Path) -> dict[tuple[str, str], np.ndarray]:
     ]
     targets = [(channel["target"], outputs[channel["sampler"]]) for channel in animation["channels"]]
     return {(nodes[target["node"]].get("name", ""), target["path"]): keys.reshape(-1) for target, keys in targets}
-
-
-def test_eyes_that_no_shape_moves_turn_in_the_head(run: Run, tmp_path: Path) -> None:
-    data = sheet(tmp_path / "sheet.glb", ("jawOpen",)).read_bytes()
-
-    def with_eye(root: dict[str, Any]) -> None:
-        root["nodes"][0]["children"] = [1]
-        root["nodes"].append({"name": "LeftEye", "translation": [0.01, 0.02, 0.03]})
-
-    way = run("pose", edited(data, tmp_path / "eye.glb", with_eye))["ways"]["LeftEye"]
-    x, y, z = np.sin(0.2) * np.cos(0.1), np.sin(0.1), np.cos(0.2) * np.cos(0.1)  # 0.2 to the person's left, 0.1 up
-    expected = [np.cos(0.3) * x + np.sin(0.3) * z, y, np.cos(0.3) * z - np.sin(0.3) * x]
-    np.testing.assert_allclose(way, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("bone", ["Head", "LeftEye"])
@@ -394,12 +354,6 @@ def test_an_eye_whose_skin_looks_by_shapes_is_not_turned_too(run: Run, tmp_path:
     turned = {"Head", "RightEye"} | ({"LeftEye"} if bone == "Head" else set())
     for name in ("page.glb", "python.glb"):
         assert {node for node, way in animated(tmp_path / name) if way == "rotation"} == turned, name
-
-
-def edited(data: bytes, path: Path, edit: Callable[[dict[str, Any]], None]) -> Path:
-    """A ``.glb`` with its document changed."""
-    path.write_bytes(data)
-    return rewrite(path, edit)
 
 
 def document(path: Path, **fields: object) -> Path:
