@@ -41,7 +41,7 @@ def arkit(
             and others write them), or meshes of SOURCE's topology: a folder of .obj or .ply, a frame each, a mesh
             sequence (.safetensors), an array of vertices (.npz), face anchors with their vertices (.json), a
             point cache in USD, as of Audio2Face, or an animated .glb.
-        weights: ARKit weights (.csv, .json, .txt, .gesichter).
+        weights: ARKit weights (.csv, .json, .txt).
         template: The rig whose shapes are given; the embedded performer if absent. ICT-FaceKit's FaceXModel has shapes
             of scanned people.
         landmarks: SOURCE's landmarks (.ljson, .pts, .json, or correspondences of `torchface pick`) where it has none
