@@ -25,7 +25,7 @@ def arkit(
     """Give any head ARKit's 52 shapes on its own vertices, or turn its animations into ARKit weights and back.
 
     SOURCE is a head model as its authors publish it (GNM Head's gnm_head.npz, FLAME's arrays as .npz or .safetensors,
-    Basel's .h5, MHR's lodN.npz, eos's .bin), a rig with other shapes, or a mesh. A template is registered to it; its
+    Basel's .h5, MHR's lodN.npz), a rig with other shapes, or a mesh. A template is registered to it; its
     shapes go over to the vertices of the head, whose number and order stay. Eyeballs turn, teeth go with the jaw.
     Shapes that SOURCE has under ARKit's names, or names that mean the same, are kept.
 
