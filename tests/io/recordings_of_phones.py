@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from torchface.io.protocols.ifacialmocap_packets import IFacialMocapPackets
+from torchface.io.protocols.live_link_packets import LiveLinkPackets
 from torchface.shape_names import ARKIT
 
 TONGUE = (
@@ -119,11 +120,13 @@ def mediapipe(path: Path, weights: Tensor, javascript: bool = False) -> Path:
     return path
 
 
-def recorded_packets(path: Path) -> list[bytes]:
-    """Packets of Live Link Face as LLV records them: gzip of version, number of packets, and each with its size."""
-    data, at, packets = gzip.decompress(path.read_bytes()), 5, list[bytes]()
-    while at < len(data):
-        (size,) = struct.unpack_from("!I", data, at)
-        packets.append(data[at + 4 : at + 4 + size])
-        at += 4 + size
-    return packets
+def gesichter(path: Path, weights: Tensor, rotations: Tensor, numbers: list[int] | None = None) -> Path:
+    """gzip of version, number of packets, and each with its size before it."""
+    packets = LiveLinkPackets(ARKIT, 60.0, "iPhone")
+    data = []
+    for i, (w, r) in enumerate(zip(weights, rotations, strict=True)):
+        packets._sent = i if numbers is None else numbers[i]
+        data += packets(w, r)
+    whole = struct.pack("!BI", 6, len(data)) + b"".join(struct.pack("!I", len(packet)) + packet for packet in data)
+    path.write_bytes(gzip.compress(whole))
+    return path

@@ -1,5 +1,6 @@
 """Head models in the layouts in which others publish theirs, made of the embedded performer's head."""
 
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -135,3 +136,34 @@ def write_basel(rig: BlendshapeRig, path: Path) -> None:
         named = {"center.nose.tip": nose, "left.eye.corner_outer": left, "right.eye.corner_outer": right}
         text = str([{"id": name, "coordinates": at} for name, at in named.items()]).replace("'", '"')
         file["metadata/landmarks/json"] = np.frombuffer(text.encode(), np.uint8)
+
+
+def write_eos(rig: BlendshapeRig, path: Path) -> None:
+    """A model of eos, version 4: shape, colour, blendshapes, the 68 landmarks by number."""
+    faces, count = rig.neutral.faces.numpy(), len(rig.vertices)
+
+    def matrix(values: Tensor) -> bytes:  # column by column
+        return struct.pack("<ii", *values.shape) + values.T.contiguous().float().numpy().astype("<f4").tobytes()
+
+    def triangles(rows: np.ndarray) -> bytes:
+        return struct.pack("<Q", len(rows)) + rows.astype("<i4").tobytes()
+
+    def model(mean: Tensor, modes: Tensor) -> bytes:
+        flat = modes.flatten(1).double()
+        deviation = flat.norm(dim=1)
+        basis = (flat / deviation[:, None]).T
+        return matrix(mean.reshape(-1, 1)) + matrix(basis) + matrix(deviation.square()[:, None]) + triangles(faces)
+
+    pieces = [struct.pack("<I", 4), model(rig.vertices, identity_modes())]
+    pieces.append(model(torch.full((count, 3), 0.5), torch.eye(3 * count)[:1].reshape(1, count, 3)))
+    basis = expression_basis(rig)
+    pieces.append(struct.pack("<BiQ", 0, 1, len(basis)))
+    for row, delta in enumerate(basis):
+        name = f"shape_{row}".encode()
+        pieces.append(struct.pack("<Q", len(name)) + name + matrix(delta.reshape(-1, 1)))
+    pieces.append(struct.pack("<BQ", 0, 68))
+    for row, vertex in enumerate(rig.neutral.landmarks.tolist()):
+        name = str(row + 1).encode()
+        pieces.append(struct.pack("<Q", len(name)) + name + struct.pack("<i", vertex))
+    pieces.append(struct.pack("<QQ", 0, 0))
+    path.write_bytes(b"".join(pieces))

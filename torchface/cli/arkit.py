@@ -25,7 +25,7 @@ def arkit(
     """Give any head ARKit's 52 shapes on its own vertices, or turn its animations into ARKit weights and back.
 
     SOURCE is a head model as its authors publish it (GNM Head's gnm_head.npz, FLAME's arrays as .npz or .safetensors,
-    Basel's .h5, MHR's lodN.npz), a rig with other shapes, or a mesh. A template is registered to it; its
+    Basel's .h5, MHR's lodN.npz, eos's .bin), a rig with other shapes, or a mesh. A template is registered to it; its
     shapes go over to the vertices of the head, whose number and order stay. Eyeballs turn, teeth go with the jaw.
     Shapes that SOURCE has under ARKit's names, or names that mean the same, are kept.
 
@@ -41,7 +41,7 @@ def arkit(
             and others write them), or meshes of SOURCE's topology: a folder of .obj or .ply, a frame each, a mesh
             sequence (.safetensors), an array of vertices (.npz), face anchors with their vertices (.json), a
             point cache in USD, as of Audio2Face, or an animated .glb.
-        weights: ARKit weights (.csv, .json, .txt).
+        weights: ARKit weights (.csv, .json, .txt, .gesichter).
         template: The rig whose shapes are given; the embedded performer if absent. ICT-FaceKit's FaceXModel has shapes
             of scanned people.
         landmarks: SOURCE's landmarks (.ljson, .pts, .json, or correspondences of `torchface pick`) where it has none

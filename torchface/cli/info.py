@@ -15,7 +15,7 @@ def info(
 
     Args:
         path: A .glb, USD, .obj, .ply, .stl, .off, .c3d, .trc, .csv, .txt (Face Cap, iFacialMocap), .json (attachment,
-            Audio2Face, ARKit) or .onnx file, arrays (.npz, .npy, .safetensors), what
+            Audio2Face, ARKit), .gesichter or .onnx file, arrays (.npz, .npy, .safetensors), what
             `fit` writes of a photograph (.pts, .toml), landmarks (.ljson, dlib's .xml), MediaPipe's .task, or a rig's
             folder.
         attachment: Report which shapes of the rig these markers distinguish.

@@ -59,8 +59,8 @@ def live(
             the terminal asks for rest and four poses, two seconds each.
         to: Where weights are sent to, again for each: livelink://HOST:11111 (Live Link Face, for Unreal),
             vmc://HOST:39539 (VMC protocol), osc://HOST:PORT/PREFIX (PREFIX/weights/jawOpen and so on),
-            ifacialmocap://HOST:49983. Options of an address: ?rate=30 (frames a second at most), map=FILE (a mapping
-            table), names=arkit+vrm0+vrm1 (vmc).
+            vrchat://HOST:9000, vts://HOST:8001 (VTube Studio), ifacialmocap://HOST:49983. Options of an address:
+            ?rate=30 (frames a second at most), map=FILE (a mapping table), names=arkit+vrm0+vrm1 (vmc).
         record: Record from the first frame on into this folder: weights.csv by the character's names, live_link.csv,
             animation.glb (the character's own file with weights, head, neck and eyes), summary.json; where it holds a
             take, into a folder take_2 of it. The page's button records into `recordings` without.

@@ -31,7 +31,7 @@ def retarget(
 
     Args:
         weights: Live Link Face CSV, frame,time,<shape>,..., OpenFace's CSV for its action units, a recording (.json of
-            MediaPipe, Audio2Face or ARKit; .txt), or an animated rig.
+            MediaPipe, Audio2Face or ARKit; .txt, .gesichter), or an animated rig.
         to: The rig that shall move: .glb, USD, a folder of OBJ files, or ICT-FaceKit's FaceXModel folder.
         from_: The rig that the weights were solved on; its shapes must all be known to the table or by name. Without
             it the names in WEIGHTS are taken as they are.

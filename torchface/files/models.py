@@ -20,7 +20,7 @@ from torchface.number_checks import checked_number
 
 FORMAT = 1
 DESCRIPTION, STATE, CARD = "model.toml", "state.safetensors", "CARD.md"
-_MAX_CARD_BYTES = 2**18
+MAX_CARD_BYTES = 2**18
 _TEXTS = ("kind", "sha256", "licence", "data", "recipe", "url")
 
 
@@ -82,7 +82,7 @@ def read_record(folder: str | Path) -> ModelRecord:
 def read_card(folder: str | Path) -> str:
     """What ``CARD.md`` says, as far as it is text; nothing where there is none."""
     path = _inside(Path(folder), CARD)
-    return read_file(path, _MAX_CARD_BYTES).decode("utf-8", "replace") if path.is_file() else ""
+    return read_file(path, MAX_CARD_BYTES).decode("utf-8", "replace") if path.is_file() else ""
 
 
 Model = TypeVar("Model", bound=nn.Module)
@@ -97,14 +97,7 @@ def read_model(folder: str | Path, kinds: Mapping[str, type[Model]]) -> Model:
     folder = Path(folder)
     record = _known_record(folder, kinds)
     path, state_path = folder / DESCRIPTION, _state_path(folder)
-    try:
-        with torch.device("meta"):
-            model = kinds[record.kind].from_config(current_config(record.kind, record.config))  # type: ignore[attr-defined]
-        expected = model.state_dict()
-    except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
-        raise FileFormatError(f"{path}: config cannot be used ({type(error).__name__}: {error})") from error
-    except (RuntimeError, ArithmeticError, RecursionError, MemoryError, TorchfaceError) as error:
-        raise FileFormatError(f"{path}: config cannot be used ({error})") from error
+    model, expected = _bare_model(path, record, kinds)
     state, data = read_state(state_path, expected, record.size, record.kind)
     digest = hashlib.sha256(data).hexdigest()
     if digest != record.sha256:
@@ -119,6 +112,32 @@ def read_model(folder: str | Path, kinds: Mapping[str, type[Model]]) -> Model:
     except (RuntimeError, TorchfaceError) as error:
         raise FileFormatError(f"{path}: config and state do not fit ({error})") from error
     return model.eval()
+
+
+def check_claims(folder: Path, kinds: Mapping[str, type[nn.Module]]) -> ModelRecord:
+    """The record of a folder whose state may not be there yet: of one of these kinds, its size no more than its config
+    asks for.
+    """
+    record = _known_record(folder, kinds)
+    _, expected = _bare_model(folder / DESCRIPTION, record, kinds)
+    largest = sum(8 * tensor.numel() for tensor in expected.values()) + MAX_HEADER_BYTES
+    if record.size > largest:
+        raise FileFormatError(
+            f"{folder / DESCRIPTION}: found size = {record.size}, expected at most {largest}, which its config asks for"
+        )
+    return record
+
+
+def _bare_model(path: Path, record: ModelRecord, kinds: Mapping[str, type[Model]]) -> tuple[Model, dict[str, Tensor]]:
+    """A model that has learned nothing yet, and the state that it wants; neither takes memory."""
+    try:
+        with torch.device("meta"):
+            model = kinds[record.kind].from_config(current_config(record.kind, record.config))  # type: ignore[attr-defined]
+        return model, model.state_dict()
+    except (TypeError, ValueError, KeyError, IndexError, AttributeError) as error:
+        raise FileFormatError(f"{path}: config cannot be used ({type(error).__name__}: {error})") from error
+    except (RuntimeError, ArithmeticError, RecursionError, MemoryError, TorchfaceError) as error:
+        raise FileFormatError(f"{path}: config cannot be used ({error})") from error
 
 
 def model_fault(folder: str | Path, kinds: Collection[str]) -> str | None:
@@ -171,7 +190,7 @@ def _inside(folder: Path, name: str) -> Path:
     return path
 
 
-_MAX_HEADER_BYTES = 2**20
+MAX_HEADER_BYTES = 2**20
 _FAMILIES = {
     **dict.fromkeys(("F16", "F32", "F64"), "float"),
     **dict.fromkeys(("I8", "I16", "I32", "I64", "U8"), "int"),
@@ -208,8 +227,8 @@ def read_state(
     try:
         check_size(path, size)
         with path.open("rb") as file:
-            if int.from_bytes(file.read(8), "little") > _MAX_HEADER_BYTES:
-                raise FileFormatError(f"{path}: no readable state (found a header above {_MAX_HEADER_BYTES} bytes)")
+            if int.from_bytes(file.read(8), "little") > MAX_HEADER_BYTES:
+                raise FileFormatError(f"{path}: no readable state (found a header above {MAX_HEADER_BYTES} bytes)")
             with safe_open(path, framework="pt") as stored:  # reads and checks the header alone
                 names = current_state_keys(kind, stored.keys(), expected)
                 _check(path, {names[key]: stored.get_slice(key) for key in stored.keys()}, expected)  # noqa: SIM118

@@ -16,7 +16,7 @@ from torchface.io.landmarks.picks import (
 )
 from torchface.io.mesh_files import load_mesh, save_mesh
 from torchface.io.meshes.mesh_sequence import MeshSequence, MeshSequenceWriter
-from torchface.io.protocols.weight_sender import WeightSender, open_sender
+from torchface.io.protocols.weight_sender import FrameSender, WeightSender, open_sender
 from torchface.io.rig_files import load_animation, load_detail_maps, load_rig, save_animation, save_rig
 from torchface.io.rigs.ict_facekit import IdentityModes, load_ict_facekit, load_identity_modes
 from torchface.io.rigs.rig_folder import load_obj_folder
@@ -26,6 +26,7 @@ from torchface.io.weights.live_link_csv import save_live_link
 
 __all__ = [
     "Correspondences",
+    "FrameSender",
     "HeadJoints",
     "HeadModelFile",
     "IdentityModes",

@@ -14,6 +14,7 @@ from torchface.io.landmarks.openface_csv import is_landmark_header, load_landmar
 from torchface.io.markers.c3d import load_c3d, save_c3d
 from torchface.io.markers.marker_csv import is_marker_header, load_markers_csv, save_markers_csv
 from torchface.io.markers.trc import load_trc, save_trc
+from torchface.io.protocols.live_link_recordings import load_live_link_packets
 from torchface.io.tables.csv_table import MAX_TABLE_BYTES, TableReader, quoted
 from torchface.io.tables.numbered_csv import is_numbered
 from torchface.io.weights.action_unit_csv import LARGEST_INTENSITY, is_action_unit_header, load_action_units
@@ -28,7 +29,7 @@ from torchface.take import Take, Track
 
 MARKER_ENDINGS = (".c3d", ".trc")
 TAKE_ENDINGS = (*MARKER_ENDINGS, ".csv")
-RECORDING_ENDINGS = (".txt", ".json")
+RECORDING_ENDINGS = (".txt", ".json", ".gesichter")
 """Of weights as phones and other programs record them, which are read alone."""
 
 LARGEST_WEIGHT = 5.0  # nobody drives a shape so far; where a tenth of the frames do, weights are in percent
@@ -51,6 +52,7 @@ def load_take(path: str | Path, unit: str | None = None, fps: float | None = Non
     ``frame,timestamp,...,AU01_r,...``   intensities of action units as weights, 0 to 1 in place of 0 to 5
     ``.txt``                             weights of Face Cap (``k,...``) or iFacialMocap (``jawOpen-12|...``)
     ``.json``                            weights of Audio2Face, frames of ARKit's face anchors or of MediaPipe
+    ``.gesichter``                       weights of Live Link Face's packets as they were sent
     ==================================== =====================================================
 
     A frame in which no marker was seen loads as NaN; :func:`torchface.take.empty_frames` finds it. Weights in percent,
@@ -82,6 +84,8 @@ def load_take(path: str | Path, unit: str | None = None, fps: float | None = Non
         return load_trc(path, unit)
     if suffix == ".json":
         return in_usual_units(load_weight_json(path, fps), path)
+    if suffix == ".gesichter":
+        return load_live_link_packets(path)
     if suffix == ".txt":
         return in_usual_units(_load_text(path), path)
     header = TableReader(path).header

@@ -12,7 +12,7 @@ from torchface.shape_names.arkit_names import (
 )
 from torchface.shape_names.arkit_names import near_names as near_names
 from torchface.shape_names.arkit_names import read_as_arkit as read_as_arkit
-from torchface.shape_names.name_tables import METAHUMAN, VRM0, VRM1, ClipTable, TwinTable
+from torchface.shape_names.name_tables import METAHUMAN, UNIFIED, VISEMES, VRM0, VRM1, ClipTable, TwinTable
 from torchface.shape_names.pose_names import is_action_unit as is_action_unit
 from torchface.shape_names.recognised_names import RecognisedShape, recognised_shapes
 from torchface.shape_names.recognised_names import recognised_mapping as recognised_mapping
@@ -22,6 +22,8 @@ __all__ = [
     "ANTAGONISTS",
     "ARKIT",
     "METAHUMAN",
+    "UNIFIED",
+    "VISEMES",
     "VRM0",
     "VRM1",
     "ClipTable",

@@ -1,4 +1,4 @@
-"""Tables from ARKit's names to VRM's clips and MetaHuman's curves, and back."""
+"""Tables from ARKit's names to Unified Expressions, VRM's clips, Oculus' visemes and MetaHuman's curves, and back."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,8 +10,9 @@ from torch import Tensor
 from torchface.shape_names.arkit_names import ARKIT
 
 _SIDES = ("Left", "Right")
+_COMES_BACK = 0.99
 _NOTHING = 1e-6  # of a factor
-_RIDGE = 1e-5
+_RIDGE = 1e-5  # without it a clip without a pose has no weight of its own
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,19 +21,23 @@ class TwinTable:
 
     Args:
         twins: for each of ARKit's names those that it drives; together they give it their mean.
+        others: names that ARKit has nothing for.
 
     Example:
         >>> table = TwinTable({"cheekPuff": ("CheekPuffLeft", "CheekPuffRight")})
         >>> table.to_arkit(torch.tensor([0.25, 0.75]))[ARKIT.index("cheekPuff")].item()
         0.5
+        >>> table.lost_here()
+        ('CheekPuffLeft', 'CheekPuffRight')
     """
 
     twins: Mapping[str, tuple[str, ...]]
+    others: tuple[str, ...] = ()
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """All names, in ARKit's order."""
-        return tuple(name for arkit in ARKIT for name in self.twins.get(arkit, ()))
+        """All names, in ARKit's order, then the others."""
+        return (*(name for arkit in ARKIT for name in self.twins.get(arkit, ())), *self.others)
 
     @cached_property
     def _copies(self) -> Tensor:
@@ -43,13 +48,21 @@ class TwinTable:
         return matrix
 
     def from_arkit(self, weights: Tensor) -> Tensor:
-        """ARKit's weights (...,52) by these names (...,N)."""
+        """ARKit's weights (...,52) by these names (...,N); 0 for those that ARKit has nothing for."""
         return weights @ self._copies.to(weights).T
 
     def to_arkit(self, weights: Tensor) -> Tensor:
         """Weights (...,N) as ARKit's (...,52); 0 for those that these names lack."""
         copies = self._copies.to(weights)
         return weights @ (copies / copies.sum(0).clamp(min=1))
+
+    def lost(self) -> tuple[str, ...]:
+        """ARKit's names whose weight does not come back from here."""
+        return _changed(ARKIT, self.to_arkit(self.from_arkit(torch.eye(len(ARKIT)))))
+
+    def lost_here(self) -> tuple[str, ...]:
+        """These names whose weight does not come back from ARKit."""
+        return _changed(self.names, self.from_arkit(self.to_arkit(torch.eye(len(self.names)))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +73,7 @@ class ClipTable:
     clip alone.
 
     Args:
-        poses: for each clip ARKit's weights.
+        poses: for each clip ARKit's weights; a clip without any is the face at rest and has what the others leave of 1.
         both: a clip that is two others at once: it takes what the two have in common.
 
     Example:
@@ -89,7 +102,7 @@ class ClipTable:
 
     @cached_property
     def _solved(self) -> list[int]:
-        return [row for row, name in enumerate(self.names) if name not in self.both]
+        return [row for row, name in enumerate(self.names) if self.poses[name] and name not in self.both]
 
     @cached_property
     def _hessian(self) -> Tensor:
@@ -114,6 +127,9 @@ class ClipTable:
             clips[:, index(left)] -= common
             clips[:, index(right)] -= common
             clips[:, index(whole)] = common
+        for row, name in enumerate(self.names):
+            if not self.poses[name]:
+                clips[:, row] = (1 - clips.sum(1)).clamp(min=0)
         return clips.reshape(*weights.shape[:-1], -1).to(weights)
 
     def factors(self, names: Sequence[str]) -> dict[str, dict[str, float]]:
@@ -125,10 +141,70 @@ class ClipTable:
             for column, name in enumerate(names)
         }
 
+    def lost(self) -> tuple[str, ...]:
+        """ARKit's names whose weight does not come back from here."""
+        return _changed(ARKIT, self.to_arkit(self.from_arkit(torch.eye(len(ARKIT)))))
+
+    def lost_here(self) -> tuple[str, ...]:
+        """These names whose weight does not come back from ARKit."""
+        return _changed(self.names, self.from_arkit(self.to_arkit(torch.eye(len(self.names)))))
+
     def renamed(self, names: Mapping[str, str]) -> "ClipTable":
         """The same clips by other names."""
         both = {names[whole]: (names[left], names[right]) for whole, (left, right) in self.both.items()}
         return ClipTable({names[name]: pose for name, pose in self.poses.items()}, both)
+
+
+def _changed(names: tuple[str, ...], back: Tensor) -> tuple[str, ...]:
+    return tuple(name for name, weight in zip(names, back.diagonal().tolist(), strict=True) if weight < _COMES_BACK)
+
+
+def _sided(*pairs: tuple[str, str]) -> dict[str, tuple[str, ...]]:
+    """Twins of both sides of pairs; several twins are divided by blanks."""
+    return {arkit + side: tuple(name + side for name in names.split()) for arkit, names in pairs for side in _SIDES}
+
+
+def _spread(arkit: str, *names: str) -> dict[str, tuple[str, ...]]:
+    """Twins of one of ARKit's shapes that are divided into sides."""
+    return {arkit: tuple(name + side for name in names for side in _SIDES)}
+
+
+UNIFIED = TwinTable(
+    {
+        **_sided(("eyeBlink", "EyeClosed"), ("eyeLookDown", "EyeLookDown"), ("eyeLookIn", "EyeLookIn")),
+        **_sided(("eyeLookOut", "EyeLookOut"), ("eyeLookUp", "EyeLookUp"), ("eyeSquint", "EyeSquint")),
+        **_sided(("eyeWide", "EyeWide"), ("browDown", "BrowLowerer BrowPinch"), ("browOuterUp", "BrowOuterUp")),
+        **_sided(("cheekSquint", "CheekSquint"), ("noseSneer", "NoseSneer"), ("mouthFrown", "MouthFrown")),
+        **_sided(("mouthSmile", "MouthCornerPull MouthCornerSlant"), ("mouthDimple", "MouthDimple")),
+        **_sided(("mouthStretch", "MouthStretch"), ("mouthPress", "MouthPress"), ("mouthLowerDown", "MouthLowerDown")),
+        **_sided(("mouthUpperUp", "MouthUpperUp MouthUpperDeepen"), ("jaw", "Jaw")),
+        **_spread("browInnerUp", "BrowInnerUp"),
+        **_spread("cheekPuff", "CheekPuff"),
+        **_spread("mouthFunnel", "LipFunnelUpper", "LipFunnelLower"),
+        **_spread("mouthPucker", "LipPuckerUpper", "LipPuckerLower"),
+        **_spread("mouthRollUpper", "LipSuckUpper"),
+        **_spread("mouthRollLower", "LipSuckLower"),
+        **{f"mouth{side}": (f"MouthUpper{side}", f"MouthLower{side}") for side in _SIDES},
+        "jawForward": ("JawForward",),
+        "jawOpen": ("JawOpen",),
+        "mouthClose": ("MouthClosed",),
+        "mouthShrugUpper": ("MouthRaiserUpper",),
+        "mouthShrugLower": ("MouthRaiserLower",),
+        "tongueOut": ("TongueOut",),
+    },
+    (
+        *(
+            name + side
+            for name in ("EyeDilation", "EyeConstrict", "NasalDilation", "NasalConstrict")
+            for side in _SIDES
+        ),
+        *(name + side for name in ("CheekSuck", "LipSuckCorner", "MouthTightener") for side in _SIDES),
+        *("JawBackward", "JawClench", "JawMandibleRaise", "TongueUp", "TongueDown", "TongueRight", "TongueLeft"),
+        *("TongueRoll", "TongueBendDown", "TongueCurlUp", "TongueSquish", "TongueFlat", "TongueTwistRight"),
+        *("TongueTwistLeft", "SoftPalateClose", "ThroatSwallow", "NeckFlexRight", "NeckFlexLeft"),
+    ),
+)
+"""Unified Expressions, the standard of VRCFaceTracking. Source: docs.vrcft.io, Tracking Standard Comparison."""
 
 
 def _curves(arkit: str, *names: str) -> dict[str, tuple[str, ...]]:
@@ -211,3 +287,25 @@ VRM1 = VRM0.renamed(
     )
 )
 """The same clips by VRM 1's names."""
+
+VISEMES = ClipTable(
+    {
+        "sil": {},
+        "PP": {"mouthPress": 0.6, "mouthRollUpper": 0.3},
+        "FF": {"mouthRollLower": 0.6, "mouthUpperUp": 0.3},
+        "TH": {"tongueOut": 0.4, "jawOpen": 0.15},
+        "DD": {"mouthUpperUp": 0.2, "mouthLowerDown": 0.3, "jawOpen": 0.15},
+        "kk": {"mouthUpperUp": 0.3, "jawOpen": 0.25},
+        "CH": {"mouthFunnel": 0.5, "mouthShrugUpper": 0.4},
+        "SS": {"mouthStretch": 0.4, "mouthLowerDown": 0.4, "mouthShrugLower": 0.2},
+        "nn": {"mouthLowerDown": 0.3, "jawOpen": 0.1, "mouthShrugLower": 0.4},
+        "RR": {"mouthFunnel": 0.3, "mouthPucker": 0.3, "jawOpen": 0.1},
+        "aa": {"jawOpen": 0.7},
+        "E": {"jawOpen": 0.35, "mouthStretch": 0.4, "mouthDimple": 0.3},
+        "I": {"mouthStretch": 0.6, "mouthSmile": 0.3, "jawOpen": 0.1},
+        "O": {"mouthFunnel": 0.6, "jawOpen": 0.4},
+        "U": {"mouthPucker": 0.9, "jawOpen": 0.1},
+    },
+    {},
+)
+"""Oculus' 15 visemes, named as Meta's Viseme Reference does; what each is in ARKit's weights is our choice."""

@@ -14,6 +14,7 @@ from torchface.files.models import CARD, ModelRecord, read_card, read_model, rea
 from torchface.landmarks import BoxNetwork, EyeNetwork, LandmarkNetwork, LandmarkTrees, UVLandmarkDetector
 from torchface.landmarks.images.networks.part_network import PartNetwork
 from torchface.modeling import ExpressionRegression, HeadModel
+from torchface.zoo.hub import fetch_description, hub_reference
 from torchface.zoo.kinds import KINDS
 from torchface.zoo.model_folders import find, is_path, named_folders
 
@@ -45,6 +46,8 @@ class ModelDescription(ModelRecord):
 def describe(name_or_path: str | Path) -> ModelDescription:
     """What a model is, without loading it: kind, licence, data, metrics, recipe, url, size and sha256 of its state.
 
+    Of a Hugging Face repository only the description and the card are fetched.
+
     Raises:
         NameMismatchError: there is no model of this name.
         FileFormatError: its ``model.toml`` cannot be read.
@@ -53,13 +56,14 @@ def describe(name_or_path: str | Path) -> ModelDescription:
         >>> describe("face_landmarks").kind
         'landmark_trees'
     """
-    folder = find(name_or_path)
+    reference = hub_reference(str(name_or_path))
+    folder = find(name_or_path) if reference is None else fetch_description(reference)
     record = dict(vars(read_record(folder)))
-    record["url"] = record["url"] or folder.resolve().as_uri()
+    record["url"] = record["url"] or (folder.resolve().as_uri() if reference is None else str(reference))
     shadowed = () if is_path(name_or_path) else tuple(named_folders(str(name_or_path))[1:])
     return ModelDescription(
         **record,
-        name=folder.name,
+        name=folder.name if reference is None else reference.name,
         folder=folder,
         shadowed=shadowed,
         summary=_summary(read_card(folder)),
@@ -113,7 +117,9 @@ def get_model(name_or_path: str | Path, kind: type[nn.Module] = nn.Module, *, de
 
     Args:
         name_or_path: a name of :func:`list_models`; or a folder, as a ``Path`` or by its path. A name of the zoo goes
-            before a folder of that name in the working directory; a separator (``./head``) asks for the folder.
+            before a folder of that name in the working directory; a separator (``./head``) asks for the folder. Or
+            ``hf://owner/name``, ``hf://owner/name@revision``, ``hf://owner/name/folder``: a repository of the Hugging
+            Face Hub, fetched once (extra ``hub``).
         kind: the class that the model has to be of, or a base of it.
         device: where the model is to lie, such as ``"cuda:1"``.
 
@@ -124,6 +130,7 @@ def get_model(name_or_path: str | Path, kind: type[nn.Module] = nn.Module, *, de
         NameMismatchError: there is no model of this name, or it is of another kind.
         FileFormatError: a file is missing, damaged, of a newer format, or does not have the hash it should have.
         ValueRangeError: the device is not there.
+        MissingExtraError: a repository is asked for, and ``huggingface_hub`` is not installed.
 
     Example:
         >>> prior = get_model("shape_prior")

@@ -8,6 +8,7 @@ from pathlib import Path
 from torchface.errors import FileFormatError, NameMismatchError
 from torchface.files.model_roots import is_folder, is_model, model_names, model_roots
 from torchface.files.models import DESCRIPTION, model_fault
+from torchface.zoo.hub import fetch_model, hub_reference
 from torchface.zoo.kinds import KINDS
 
 HOME = "TORCHFACE_HOME"
@@ -46,6 +47,8 @@ def find(name_or_path: str | Path) -> Path:
         ['CARD.md', 'model.toml', 'state.safetensors']
     """
     given = str(name_or_path)
+    if reference := hub_reference(given):
+        return fetch_model(reference)
     if is_path(name_or_path):
         folder = Path(given)
         if not is_folder(folder):

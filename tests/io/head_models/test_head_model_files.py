@@ -26,6 +26,7 @@ from planted.published_heads import (
     identity_modes,
     mhr_arrays,
     write_basel,
+    write_eos,
 )
 from torchface.errors import FileFormatError
 from torchface.io.head_models.head_model_files import is_head_model_file, load_head_model_file
@@ -53,12 +54,14 @@ def arrays(rig: BlendshapeRig) -> dict[str, dict[str, Any]]:
     return {name: make(rig) for name, make in ARRAYS.items()}
 
 
-@pytest.mark.parametrize("name", ["flame", "gnm", "mhr", "basel"])
+@pytest.mark.parametrize("name", ["flame", "gnm", "mhr", "basel", "eos"])
 def test_each_layout_gives_the_planted_head(
     name: str, rig: BlendshapeRig, arrays: dict[str, dict[str, Any]], tmp_path: Path
 ) -> None:
-    path = tmp_path / {"basel": "model.h5"}.get(name, "model.npz")
-    if name == "basel":
+    path = tmp_path / {"basel": "model.h5", "eos": "model.bin"}.get(name, "model.npz")
+    if name == "eos":
+        write_eos(rig, path)
+    elif name == "basel":
         pytest.importorskip("h5py")
         write_basel(rig, path)
     else:
@@ -68,12 +71,32 @@ def test_each_layout_gives_the_planted_head(
     assert torch.allclose(model.neutral.vertices, rig.vertices, atol=1e-3)
     assert torch.equal(model.neutral.faces, rig.neutral.faces)
     assert torch.allclose(model.identity[:PEOPLE], identity_modes(), atol=2e-3)
-    assert len(model.identity) == {"flame": 300, "gnm": PEOPLE, "mhr": 45, "basel": PEOPLE}[name]
+    assert len(model.identity) == {"flame": 300, "gnm": PEOPLE, "mhr": 45, "basel": PEOPLE, "eos": PEOPLE}[name]
     if name == "mhr":
         assert model.expression_names[24] == "jawDrop"
         assert torch.allclose(model.expressions[24], rig.deltas[rig.index(["jawOpen"])[0]], atol=1e-3)
     else:
         assert torch.allclose(model.expressions, expression_basis(rig), atol=2e-3)
+
+
+def test_damaged_files_of_eos_are_refused_and_read_no_more_than_they_hold(rig: BlendshapeRig, tmp_path: Path) -> None:
+    path = tmp_path / "sfm.bin"
+    write_eos(rig, path)
+    whole = path.read_bytes()
+    model = load_head_model_file(path)
+    assert torch.equal(model.landmarks.on(model.neutral.vertices), rig.vertices[rig.neutral.landmarks])
+    size = len(rig.vertices) * 3
+    damaged = {
+        "truncated": whole[: len(whole) // 3],
+        "a gigabyte": whole[:4] + np.array([3 * 2**26, 1], "<i4").tobytes() + whole[12:],
+        "NaN": whole[:12] + np.full(1, np.nan, "<f4").tobytes() + whole[16:],
+        "basis": whole[: 12 + 4 * size] + np.array([7, 7], "<i4").tobytes() + whole[20 + 4 * size :],
+    }
+    for name, data in damaged.items():
+        path.write_bytes(data)
+        with pytest.raises(FileFormatError, match=r"sfm\.bin: found"):
+            load_head_model_file(path)
+        assert name
 
 
 def test_flame_is_read_from_safetensors_too(arrays: dict[str, dict[str, Any]], tmp_path: Path) -> None:
@@ -290,3 +313,16 @@ def test_a_header_that_is_no_python_is_refused(tmp_path: Path) -> None:
     (tmp_path / "v.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header + bytes(48))
     with pytest.raises(FileFormatError, match="found no readable arrays"):
         load_head_model_file(tmp_path / "v.npy")
+
+
+@pytest.mark.bench
+def test_eos_itself_reads_the_planted_file_and_its_own_is_read(rig: BlendshapeRig, tmp_path: Path) -> None:
+    models = pytest.importorskip("eos").morphablemodel
+    write_eos(rig, tmp_path / "planted.bin")
+    model = models.load_model(str(tmp_path / "planted.bin"))
+    mean = np.asarray(model.get_shape_model().get_mean()).reshape(-1, 3)
+    assert np.array_equal(mean, rig.vertices.numpy())
+    models.save_model(model, str(tmp_path / "saved.bin"))
+    saved, planted = (load_head_model_file(tmp_path / name) for name in ("saved.bin", "planted.bin"))
+    assert torch.equal(saved.expressions, planted.expressions)
+    assert saved.expression_names == planted.expression_names

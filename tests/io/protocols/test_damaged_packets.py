@@ -1,5 +1,6 @@
 """Readers of packets on damaged and built ones: faces with sane numbers, or an error of ours, at once."""
 
+import json
 import os
 import random
 import time
@@ -17,6 +18,8 @@ from torchface.io.protocols.live_link_packets import LiveLinkPackets, read_live_
 from torchface.io.protocols.osc_packets import OscPackets, OscReader
 from torchface.io.protocols.received_face import ReceivedFace
 from torchface.io.protocols.vmc_packets import VmcPackets, VmcReader
+from torchface.io.protocols.vrchat_packets import VrchatPackets
+from torchface.io.protocols.vtube_studio import _Calls, _RefusedError
 from torchface.shape_names import ARKIT
 
 CASES = int(os.environ.get("TORCHFACE_FUZZ_CASES", "100"))
@@ -28,6 +31,7 @@ PROTOCOLS: dict[str, tuple[Callable[[], Read], list[bytes]]] = {
     "ifacialmocap": (lambda: read_ifacialmocap, IFacialMocapPackets(ARKIT)(WEIGHTS, ROTATIONS)),
     "vmc": (VmcReader, VmcPackets(ARKIT)(WEIGHTS, ROTATIONS)),
     "osc": (OscReader, OscPackets(ARKIT)(WEIGHTS, ROTATIONS)),
+    "unified": (OscReader, VrchatPackets(ARKIT)(WEIGHTS, ROTATIONS)),
 }
 
 
@@ -67,3 +71,28 @@ def test_a_built_packet_is_a_face_or_refused(protocol: str, data: st.DataObject)
     seed = data.draw(st.sampled_from(seeds))
     at, length = data.draw(st.integers(0, len(seed))), data.draw(st.integers(0, 40))
     check(make(), seed[:at] + data.draw(st.binary(max_size=40)) + seed[at + length :])
+
+
+def test_a_mutated_answer_of_vtube_studio_is_taken_or_refused() -> None:
+    head = {"apiName": "VTubeStudioPublicAPI", "apiVersion": "1.0", "requestID": "torchface-1"}
+    good = [
+        json.dumps(
+            {**head, "messageType": "AuthenticationResponse", "data": {"authenticated": True, "reason": "valid"}}
+        ),
+        json.dumps({**head, "messageType": "APIError", "data": {"errorID": 50, "message": "denied"}}),
+    ]
+    generator, taken = random.Random(0), 0
+    for _ in range(CASES):
+        answers = [mutated(generator.choice(good).encode(), generator)]
+
+        def receive(seconds: float, left: list[bytes] = answers) -> bytes:
+            if not left:
+                raise ValueError("no more")
+            return left.pop()
+
+        try:
+            _Calls(lambda text: None, receive)("AuthenticationRequest", {}, 0.1)
+            taken += 1
+        except (ValueError, _RefusedError):
+            continue
+    assert 0 < taken < CASES

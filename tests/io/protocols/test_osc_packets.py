@@ -9,6 +9,7 @@ from osc_receiver import OscReceiver
 from torchface.errors import NameMismatchError
 from torchface.io.protocols.osc_messages import osc_bundles, osc_message
 from torchface.io.protocols.osc_packets import OscPackets, OscReader
+from torchface.io.protocols.vrchat_packets import VrchatPackets
 from torchface.io.protocols.weight_sender import open_sender
 from torchface.io.weights.weight_csv import ROTATIONS
 from torchface.shape_names import ARKIT
@@ -54,6 +55,13 @@ def test_what_is_sent_is_received_and_other_prefixes_are_passed_over() -> None:
     torch.testing.assert_close(face.weights, WEIGHTS)
     torch.testing.assert_close(face.rotations, ROTATION)
     assert OscReader("/other")(packet) == []
+
+
+def test_unified_expressions_move_arkits_shapes() -> None:
+    reader, found = OscReader(), []
+    for packet in VrchatPackets(ARKIT, ["unified"])(WEIGHTS, None):
+        found += reader(packet)
+    torch.testing.assert_close(found[-1].weights, WEIGHTS)
 
 
 def test_face_caps_own_addresses() -> None:

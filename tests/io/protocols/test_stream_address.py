@@ -11,8 +11,10 @@ from torchface.shape_names import ARKIT
 
 
 def test_schemes_have_the_ports_that_their_programs_listen_at() -> None:
-    ports = {scheme: parse_address(f"{scheme}://h").port for scheme in ("livelink", "vmc", "ifacialmocap")}
-    assert ports == {"livelink": 11111, "vmc": 39539, "ifacialmocap": 49983}
+    ports = {
+        scheme: parse_address(f"{scheme}://h").port for scheme in ("livelink", "vmc", "ifacialmocap", "vrchat", "vts")
+    }
+    assert ports == {"livelink": 11111, "vmc": 39539, "ifacialmocap": 49983, "vrchat": 9000, "vts": 8001}
     sources = {scheme: parse_source(f"{scheme}://").port for scheme in ("livelink", "ifacialmocap", "vmc")}
     assert sources == {"livelink": 11111, "ifacialmocap": 49983, "vmc": 39539}
     assert parse_source("osc://:9000/face/") == StreamAddress("osc", "", 9000, "/face")
@@ -36,7 +38,7 @@ def test_options_stand_behind_a_question_mark() -> None:
         ("vmc://h?rate=nan", "expected a rate"),
         ("vmc://h?names=vrm2", "names='vrm2'"),
         ("vmc://h?rate", "expected an address"),
-        ("vmc://h/path", "expected an address"),
+        ("vts://h/path", "expected an address"),
     ],
 )
 def test_options_that_are_none_are_refused(address: str, found: str) -> None:
@@ -45,14 +47,14 @@ def test_options_that_are_none_are_refused(address: str, found: str) -> None:
 
 
 @pytest.mark.parametrize(
-    "address", ["midi://:1", "udp://:8001", "osc://", "livelink://:70000", "vmc://:1?rate=3", "vmc:/"]
+    "address", ["midi://:1", "vts://:8001", "osc://", "livelink://:70000", "vmc://:1?rate=3", "vmc:/"]
 )
 def test_sources_that_are_none_are_refused(address: str) -> None:
     with pytest.raises(ValueRangeError, match=r"^stream: found .* expected what receives a face: livelink://:11111"):
         parse_source(address)
 
 
-@given(st.text(max_size=60) | st.from_regex(r"(vmc|osc|livelink)://.{0,40}", fullmatch=True))
+@given(st.text(max_size=60) | st.from_regex(r"(vmc|osc|vts|livelink)://.{0,40}", fullmatch=True))
 def test_any_text_is_parsed_or_refused(text: str) -> None:
     for parse in (parse_address, parse_source):
         try:

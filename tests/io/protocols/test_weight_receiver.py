@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from recordings_of_phones import recorded_packets
 
 from torchface.errors import ValueRangeError
 from torchface.io.protocols.ifacialmocap_packets import START, IFacialMocapPackets
 from torchface.io.protocols.live_link_packets import LiveLinkPackets
+from torchface.io.protocols.live_link_recordings import recorded_packets
 from torchface.io.protocols.osc_messages import osc_message
 from torchface.io.protocols.osc_packets import OscPackets
 from torchface.io.protocols.received_face import ReceivedFace
@@ -59,7 +59,7 @@ def arrived(receiver: WeightReceiver, packets: int) -> list[ReceivedFace]:
 @pytest.mark.parametrize("file", ["dao", "debug-jawopen", "debug-headyaw"])
 def test_an_iphones_packets_are_received_as_they_are(file: str, data: Path) -> None:
     path = data / "protocols" / f"live_link_{file}.gesichter"
-    packets = recorded_packets(path)
+    packets = list(recorded_packets(path))
     raw = gzip.decompress(path.read_bytes())  # the numbers by their place in the bytes, without a reader of ours
     size = int.from_bytes(raw[5:9], "big")
     expected = [struct.unpack("!61f", raw[at + size - 240 : at + size + 4]) for at in range(5, len(raw), size + 4)]

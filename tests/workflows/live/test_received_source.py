@@ -20,11 +20,11 @@ import torch
 from headless_chromium import until
 from osc_receiver import values_by_address
 from received_frames import decode_frame
-from recordings_of_phones import recorded_packets
 
 from torchface import load_take
 from torchface.capture.anybody import WebcamControls
 from torchface.cli import main
+from torchface.io.protocols.live_link_recordings import recorded_packets
 from torchface.io.protocols.received_face import ReceivedFace
 from torchface.shape_names import ARKIT
 from torchface.workflows.live import live_session
@@ -111,7 +111,7 @@ def rows_of(kept: torch.Tensor, sent: torch.Tensor, within: float = 0.0) -> list
 def test_an_iphones_packets_move_a_character_and_are_recorded_and_sent_on(
     dome: Path, tmp_path: Path, data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    packets = recorded_packets(data / "protocols" / "live_link_debug-jawopen.gesichter")
+    packets = list(recorded_packets(data / "protocols" / "live_link_debug-jawopen.gesichter"))
     port, said = free_port(), list[str]()
     with engine() as (target, came), phone(monkeypatch, packets, port, said):
         to = (f"livelink://127.0.0.1:{target}",)
@@ -143,7 +143,7 @@ def test_a_performance_of_an_iphone_is_recorded_and_sent_by_two_protocols_at_onc
     dome: Path, tmp_path: Path, data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """In its own time; read by python-osc. Between two packets of the file seven are missing."""
-    packets = recorded_packets(data / "protocols" / "live_link_dao.gesichter")
+    packets = list(recorded_packets(data / "protocols" / "live_link_dao.gesichter"))
     acted = torch.tensor([struct.unpack("!61f", packet[-244:]) for packet in packets])
     port, said = free_port(), list[str]()
     with engine() as (vmc, vmc_packets), engine() as (osc, osc_packets), phone(monkeypatch, packets, port, said, 60.0):

@@ -47,6 +47,7 @@ def test_each_receiver_has_a_rate_of_its_own_and_a_dead_one_slows_none(monkeypat
             f"livelink://127.0.0.1:{ports[0]}",
             f"livelink://127.0.0.1:{ports[1]}?rate=20",
             f"vmc://127.0.0.1:{ports[2]}",
+            "vts://127.0.0.1:9",
         )
         said: list[str] = []
         with WeightStreams(addresses, ARKIT, 60.0, said.append) as streams:
@@ -56,12 +57,14 @@ def test_each_receiver_has_a_rate_of_its_own_and_a_dead_one_slows_none(monkeypat
                 before = time.perf_counter()
                 streams.send(torch.full((52,), frame / 64), torch.zeros(9))
                 took.append(time.perf_counter() - before)
+            notes = streams.notes()
         frames = [decode_frame(packet) for packet in drained(fast, 60)]
         assert [frame.weights[JAW].item() for frame in frames] == [i / 64 for i in range(60)]
         sent = [round(64 * decode_frame(packet).weights[JAW].item()) for packet in drained(slow, 21)]
         assert sent == [0, 1, *range(3, 60, 3)]  # of 60 a second 20, and one that is early
         assert max(took) < 0.25
         assert any("nobody listens there yet" in words for words in said)
+        assert any(note.startswith("vts://127.0.0.1:9: 60 of 60 frames") for note in notes)
 
 
 def test_a_mapping_table_gives_a_receiver_names_of_its_own(receiver: OscReceiver, tmp_path: Path) -> None:
@@ -89,7 +92,7 @@ def test_a_mapping_table_gives_a_receiver_names_of_its_own(receiver: OscReceiver
 
 def test_what_a_receiver_reports_is_said_once_each(monkeypatch: pytest.MonkeyPatch) -> None:
     class Sender:
-        address, problem = "vmc://h", "not connected yet"
+        address, problem = "vts://h", "not connected yet"
 
         def send(self, weights: torch.Tensor, rotations: torch.Tensor) -> bool:
             if self.problem == "gone":
@@ -101,13 +104,13 @@ def test_what_a_receiver_reports_is_said_once_each(monkeypatch: pytest.MonkeyPat
 
     sender, said = Sender(), list[str]()
     monkeypatch.setattr(weight_streams, "open_sender", lambda *_: sender)
-    with WeightStreams(("vmc://h",), ARKIT, 30.0, said.append) as streams:
+    with WeightStreams(("vts://h",), ARKIT, 30.0, said.append) as streams:
         for problem in ("not connected yet", "not connected yet", "waits until you allow", "gone"):
             sender.problem = problem
             streams.send(torch.zeros(52), torch.zeros(9))
-        assert streams.notes() == ("vmc://h: 4 of 4 frames were not received, expected a program that listens there",)
+        assert streams.notes() == ("vts://h: 4 of 4 frames were not received, expected a program that listens there",)
     ends = ("not connected yet", "waits until you allow", "stream: cannot send")
-    assert said == [f"vmc://h: {end}; sending goes on" for end in ends]
+    assert said == [f"vts://h: {end}; sending goes on" for end in ends]
 
 
 def test_a_receiver_that_is_not_there_is_told_once_with_the_figure() -> None:

@@ -3,12 +3,12 @@
 from pathlib import Path
 
 from torchface.errors import FileFormatError
-from torchface.io.head_models import basel, flame, gnm, mhr
+from torchface.io.head_models import basel, eos, flame, gnm, mhr
 from torchface.io.head_models.array_files import ArrayFile, is_pickle
 from torchface.io.head_models.head_model_file import HeadModelFile
 
-HEAD_MODEL_ENDINGS = (".npz", ".safetensors", ".h5", ".hdf5")
-_FORMS = "GNM Head's gnm_head.npz, FLAME's arrays as .npz or .safetensors, MHR's lodN.npz, or Basel's .h5"
+HEAD_MODEL_ENDINGS = (".npz", ".safetensors", ".h5", ".hdf5", eos.ENDING)
+_FORMS = "GNM Head's gnm_head.npz, FLAME's arrays as .npz or .safetensors, MHR's lodN.npz, Basel's .h5, or eos's .bin"
 
 
 def is_head_model_file(path: str | Path) -> bool:
@@ -19,7 +19,7 @@ def is_head_model_file(path: str | Path) -> bool:
     path = Path(path)
     if not path.is_file():
         return False
-    if is_pickle(path) or basel.is_hdf5(path):
+    if is_pickle(path) or basel.is_hdf5(path) or eos.is_eos(path):
         return True
     if path.suffix.lower() not in HEAD_MODEL_ENDINGS:
         return False
@@ -31,7 +31,7 @@ def is_head_model_file(path: str | Path) -> bool:
 
 
 def load_head_model_file(path: str | Path) -> HeadModelFile:
-    """A head model as its authors' file has it, in millimetres: GNM Head, FLAME, MHR or Basel.
+    """A head model as its authors' file has it, in millimetres: GNM Head, FLAME, MHR, Basel or eos's.
 
     Which one it is the names of its arrays say. No pickle is opened. Landmarks are read of a file beside the model
     where its project keeps them in one.
@@ -54,6 +54,8 @@ def load_head_model_file(path: str | Path) -> HeadModelFile:
     path = Path(path)
     if path.is_file() and basel.is_hdf5(path):
         return basel.read_basel(path)
+    if path.is_file() and eos.is_eos(path):
+        return eos.read_eos(path)
     arrays = ArrayFile(path)
     if all(name in arrays for name in gnm.MARKS):
         return gnm.read_gnm(path, arrays)

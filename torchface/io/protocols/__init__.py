@@ -1,1 +1,1 @@
-"""Faces sent and received over a network: Live Link Face, VMC, OSC, iFacialMocap."""
+"""Faces sent and received over a network: Live Link Face, VMC, OSC, iFacialMocap, VRChat, VTube Studio."""

@@ -88,3 +88,14 @@ def read_live_link(packet: bytes) -> list[ReceivedFace]:
     except struct.error as error:
         raise FileFormatError(f"packet: found {len(packet)} bytes, expected a whole packet ({error})") from error
     return [ReceivedFace(values[: len(ARKIT)], values[len(ARKIT) :], texts[1], number, sent=sent)]
+
+
+def packet_rate(packet: bytes) -> float:
+    """Frames a second that a whole packet states."""
+    at = 1
+    for _ in range(2):
+        at += 4 + int.from_bytes(packet[at : at + 4], "big")
+    _, _, numerator, denominator = _TIME.unpack_from(packet, at)
+    rate = numerator / denominator if denominator else 0.0
+    check_rate(rate, "packet", FileFormatError)
+    return rate

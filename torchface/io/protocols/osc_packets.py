@@ -11,6 +11,7 @@ from torchface.errors import NameMismatchError, ShapeError
 from torchface.io.protocols.live_link_packets import rotations_sent
 from torchface.io.protocols.osc_messages import Message, osc_bundles, osc_message, read_osc
 from torchface.io.protocols.received_face import ReceivedFace
+from torchface.io.protocols.unified_parameters import ACTIVE, UnifiedFace
 from torchface.io.weights.arkit_values import arkit_row, rotations_of_degrees
 from torchface.io.weights.face_cap_text import FACE_CAP_ORDER
 from torchface.io.weights.weight_csv import ROTATIONS
@@ -18,6 +19,10 @@ from torchface.shape_names import ARKIT
 
 _DEFAULT_PREFIX = "/torchface"
 _NOT_IN_ADDRESSES = re.compile(r"[^!-~]|[#*,/?\[\]{}]")  # what OSC gives another meaning in an address
+
+# VRChat's own: how far both lids are shut; degrees down and to the right of the left and the right eye.
+_SHUT, _GAZE = "/tracking/eye/EyesClosedAmount", "/tracking/eye/LeftRightPitchYaw"
+_EYES = [ROTATIONS.index(name) for name in ("LeftEyePitch", "LeftEyeYaw", "RightEyePitch", "RightEyeYaw")]
 _MOST_UNUSED, _LONGEST = 1000, 100  # addresses that are remembered, and characters of each
 
 
@@ -54,14 +59,16 @@ def names_for_osc(names: Sequence[str]) -> Sequence[str]:
 class OscReader:
     """A face of addresses that end in a shape's name; each packet with one is a frame, values stay until they change.
 
-    Known are ARKit's names (``/torchface/weights/jawOpen``), rotations by Live Link Face's names in radians, and what
+    Known are ARKit's names (``/torchface/weights/jawOpen``), Unified Expressions and their sums
+    (``/avatar/parameters/v2/JawOpen``), VRChat's eye tracking, rotations by Live Link Face's names in radians, and what
     the app Face Cap sends (``/W``, ``/HR``, ``/ELR``, ``/ERR``). The others that are there are put into ``unused``.
     """
 
     def __init__(self, prefix: str = "", unused: dict[str, None] | None = None) -> None:
         self._prefix = prefix
         self._unused = {} if unused is None else unused
-        self._weights, self._rotations = torch.zeros(len(ARKIT)), torch.zeros(len(ROTATIONS))
+        self._weights = torch.full((len(ARKIT),), torch.nan)  # NaN until it comes
+        self._unified = UnifiedFace()
         self._degrees = {"/HR": [0.0] * 3, "/ELR": [0.0] * 3, "/ERR": [0.0] * 3}
 
     def __call__(self, packet: bytes) -> list[ReceivedFace]:
@@ -69,25 +76,30 @@ class OscReader:
         known = [self._take(message) for message in read_osc(packet) if message[0].startswith(self._prefix)]
         if not any(known):
             return []
-        return [ReceivedFace(self._weights.clone(), self._rotations.clone(), "OSC")]
+        weights = torch.where(self._weights.isnan(), self._unified.arkit(), self._weights)
+        return [ReceivedFace(weights, self._unified.rotations.clone(), "OSC")]
 
     def _take(self, message: Message) -> bool:
         address, values = message
         numbers = [float(value) for value in values if isinstance(value, int | float) and math.isfinite(value)]
         known = len(numbers) == len(values) > 0 and self._moves(address, numbers)
-        if not known and len(self._unused) < _MOST_UNUSED:
+        if not known and len(self._unused) < _MOST_UNUSED and not address.endswith(ACTIVE):
             self._unused[address[:_LONGEST]] = None
         return known
 
     def _moves(self, address: str, numbers: list[float]) -> bool:
-        name = address.rpartition("/")[2]
+        *folders, name = address.split("/")
         if address == "/W" and len(numbers) == 2 and 0 <= numbers[0] < len(ARKIT):
             self._weights[ARKIT.index(FACE_CAP_ORDER[int(numbers[0])])] = numbers[1]
         elif address in self._degrees and len(numbers) in (2, 3):
             self._degrees[address] = [*numbers, 0.0][:3]
-            self._rotations = rotations_of_degrees(*self._degrees.values())
+            self._unified.rotations = rotations_of_degrees(*self._degrees.values())
+        elif address == _GAZE and len(numbers) == 4:
+            self._unified.rotations[_EYES] = torch.tensor(numbers).deg2rad()
         elif name in ROTATIONS:
-            self._rotations[ROTATIONS.index(name)] = numbers[0]
+            self._unified.rotations[ROTATIONS.index(name)] = numbers[0]
+        elif folders[-1:] == ["v2"] or address == _SHUT:
+            return self._unified.take(name, numbers[0])
         elif (row := arkit_row(name)) is not None:
             self._weights[row] = numbers[0]
         else:

@@ -10,18 +10,28 @@ from torchface.errors import ValueRangeError
 from torchface.io.protocols.ifacialmocap_packets import IFACIALMOCAP_PORT
 from torchface.io.protocols.live_link_packets import LIVE_LINK_PORT
 from torchface.io.protocols.vmc_packets import NAMINGS, VMC_PORT
+from torchface.io.protocols.vrchat_packets import VRCHAT_NAMINGS, VRCHAT_PORT
+from torchface.io.protocols.vtube_studio import VTUBE_STUDIO_PORT
 
-DEFAULT_PORTS = {"livelink": LIVE_LINK_PORT, "vmc": VMC_PORT, "ifacialmocap": IFACIALMOCAP_PORT}
+DEFAULT_PORTS = {
+    "livelink": LIVE_LINK_PORT,
+    "vmc": VMC_PORT,
+    "ifacialmocap": IFACIALMOCAP_PORT,
+    "vrchat": VRCHAT_PORT,
+    "vts": VTUBE_STUDIO_PORT,
+}
 """Where receivers listen unless they are set up otherwise; the other schemes' addresses name their port."""
 
-SENT = ("udp", "livelink", "vmc", "osc", "ifacialmocap")
+SENT = ("udp", "livelink", "vmc", "osc", "ifacialmocap", "vrchat", "vts")
 RECEIVED = ("livelink", "ifacialmocap", "vmc", "osc")
 
 _OPTIONS = {
     **dict.fromkeys(("udp", "livelink"), ("rate", "map", "subject")),
-    "vmc": ("rate", "map", "names"),
+    **dict.fromkeys(("vmc", "vrchat"), ("rate", "map", "names")),
     **dict.fromkeys(("osc", "ifacialmocap"), ("rate", "map")),
+    "vts": ("rate", "map", "token"),
 }
+_NAMINGS = {"vmc": NAMINGS, "vrchat": VRCHAT_NAMINGS}
 _MOST_RATE = 1000.0
 _ADDRESS = re.compile(
     r"(?P<scheme>[a-z]+)://(?P<host>\[[0-9a-fA-F:.]+\]|[^:/?\[\]\s]*)(?::(?P<port>[0-9]{1,5}))?"
@@ -29,8 +39,8 @@ _ADDRESS = re.compile(
 )
 _EXPECTED = (
     "expected an address such as udp://127.0.0.1:11111 or livelink://127.0.0.1:11111 (Live Link Face), "
-    "vmc://127.0.0.1:39539, osc://127.0.0.1:9000/torchface or "
-    "ifacialmocap://127.0.0.1:49983, the port 1 to 65535"
+    "vmc://127.0.0.1:39539, osc://127.0.0.1:9000/torchface, ifacialmocap://127.0.0.1:49983, vrchat://127.0.0.1:9000 or "
+    "vts://127.0.0.1:8001 (VTube Studio), the port 1 to 65535"
 )
 _EXPECTED_SOURCE = (
     "expected what receives a face: livelink://:11111, ifacialmocap://PHONE, vmc://:39539 or osc://:9000/PREFIX, the "
@@ -66,7 +76,8 @@ def parse_address(address: str) -> StreamAddress:
     """The parts of an address that is sent to.
 
     Options stand behind ``?``, divided by ``&``: ``rate`` (frames a second at most), ``map`` (a mapping table),
-    ``names`` (for ``vmc``, several divided by ``+``), ``subject`` (Live Link Face).
+    ``names`` (for ``vmc`` and ``vrchat``, several divided by ``+``), ``subject`` (Live Link Face), ``token`` (a file,
+    VTube Studio).
     """
     parts = _parts(address, SENT, _EXPECTED, 1)
     if not parts.host or (parts.path and parts.scheme != "osc"):
@@ -84,10 +95,10 @@ def parse_address(address: str) -> StreamAddress:
     if rate is not None and not 0 < rate <= _MOST_RATE:
         raise ValueRangeError(f"stream: found {address!r:.200}, expected a rate up to {_MOST_RATE:.0f} frames a second")
     for naming in parts.namings() or ():
-        if naming not in NAMINGS:
+        if naming not in _NAMINGS[parts.scheme]:
             raise ValueRangeError(
                 f"stream: found names={naming!r:.40} in {address!r:.200}, expected some of "
-                f"{', '.join(NAMINGS)}, divided by +"
+                f"{', '.join(_NAMINGS[parts.scheme])}, divided by +"
             )
     return parts
 

@@ -3,6 +3,7 @@
 import socket
 import time
 from collections.abc import Callable, Sequence
+from typing import Protocol
 
 from torch import Tensor
 
@@ -12,11 +13,26 @@ from torchface.io.protocols.live_link_packets import LiveLinkPackets
 from torchface.io.protocols.osc_packets import OscPackets
 from torchface.io.protocols.stream_address import StreamAddress, parse_address, resolved
 from torchface.io.protocols.vmc_packets import NAMINGS, VmcPackets
+from torchface.io.protocols.vrchat_packets import VRCHAT_NAMINGS, VrchatPackets
+from torchface.io.protocols.vtube_studio import VTubeStudioSender, checked_token_file
 
 Encode = Callable[[Tensor, Tensor | None], list[bytes]]
 """Packets of a frame: weights (N,), and rotations (9,) in radians, none of which turn the head."""
 
 _EARLY = 0.25  # of an interval, by which frames may come before their time
+
+
+class FrameSender(Protocol):
+    """Sends frames to one receiver; ``problem`` says in words why they do not arrive, where that is known."""
+
+    address: str
+    problem: str
+
+    def send(self, weights: Tensor, rotations: Tensor | None = None) -> bool:
+        """Sends a frame without waiting: weights (N,), rotations (9,); whether none before was refused."""
+
+    def close(self) -> None:
+        """Gives back what it holds."""
 
 
 class WeightSender:
@@ -96,13 +112,14 @@ def find_receiver(address: str) -> None:
     resolved(parse_address(address), address)
 
 
-def open_sender(address: str, names: Sequence[str], fps: float) -> WeightSender:
+def open_sender(address: str, names: Sequence[str], fps: float) -> FrameSender:
     """A sender to an address.
 
     Args:
         address: ``udp://HOST:PORT`` or ``livelink://HOST:PORT`` for Live Link Face's packets, ``vmc://HOST:PORT`` for
-            the VMC protocol, ``osc://HOST:PORT/PREFIX`` for plain OSC, ``ifacialmocap://HOST:PORT``; options behind
-            ``?``, see :func:`torchface.io.protocols.stream_address.parse_address`.
+            the VMC protocol, ``osc://HOST:PORT/PREFIX`` for plain OSC, ``ifacialmocap://HOST:PORT``,
+            ``vrchat://HOST:PORT``, ``vts://HOST:PORT`` for VTube Studio; options behind ``?``, see
+            :func:`torchface.io.protocols.stream_address.parse_address`.
         names: of the weights that come, (N,).
         fps: frames a second.
 
@@ -116,6 +133,10 @@ def open_sender(address: str, names: Sequence[str], fps: float) -> WeightSender:
         >>> sender.close()
     """
     parts = parse_address(address)
+    if parts.scheme == "vts":
+        resolved(parts, address)
+        token = checked_token_file(parts.options["token"], address) if "token" in parts.options else None
+        return VTubeStudioSender(address, parts.host, parts.port, names, token, parts.rate() or 60.0)
     return WeightSender(address, _encode(parts, names, fps), parts.rate())
 
 
@@ -124,6 +145,8 @@ def _encode(parts: StreamAddress, names: Sequence[str], fps: float) -> Encode:
         return VmcPackets(names, parts.namings() or NAMINGS[:3])
     if parts.scheme == "osc":
         return OscPackets(names, parts.path)
+    if parts.scheme == "vrchat":
+        return VrchatPackets(names, parts.namings() or VRCHAT_NAMINGS[:3])
     if parts.scheme == "ifacialmocap":
         return IFacialMocapPackets(names)
     return LiveLinkPackets(names, fps, parts.options.get("subject", "torchface"))

@@ -11,7 +11,7 @@ from torch import Tensor
 from torchface.capture.retargeting import ShapeMap, load_shape_rules, shape_map
 from torchface.errors import NameMismatchError, ValueRangeError
 from torchface.io.protocols.stream_address import parse_address
-from torchface.io.protocols.weight_sender import WeightSender, open_sender
+from torchface.io.protocols.weight_sender import FrameSender, open_sender
 
 _MAP = re.compile(r"(?<=[?&])map=[^&]*&?")
 
@@ -19,7 +19,7 @@ _MAP = re.compile(r"(?<=[?&])map=[^&]*&?")
 class MappedSender:
     """A sender that gets weights by other names, after a mapping table."""
 
-    def __init__(self, sender: WeightSender, shapes: ShapeMap) -> None:
+    def __init__(self, sender: FrameSender, shapes: ShapeMap) -> None:
         self._sender, self._shapes, self.address = sender, shapes, sender.address
 
     @property
@@ -36,10 +36,10 @@ class MappedSender:
         self._sender.close()
 
 
-def mapped_sender(address: str, names: Sequence[str], fps: float) -> WeightSender | MappedSender:
+def mapped_sender(address: str, names: Sequence[str], fps: float) -> FrameSender | MappedSender:
     """A sender to an address, after the mapping table that its option ``map`` names.
 
-    The table's names are what VMC and plain OSC then send; the other protocols have names of their own, which
+    The table's names are what VMC, VRChat and plain OSC then send; the other protocols have names of their own, which
     must be among them.
     """
     parts = parse_address(address)
@@ -52,7 +52,7 @@ def mapped_sender(address: str, names: Sequence[str], fps: float) -> WeightSende
     except NameMismatchError as error:
         raise NameMismatchError(f"{path}: {error}") from error
     plain = _MAP.sub("", address).rstrip("?&")
-    if parts.scheme == "vmc" and "names" not in parts.options:
+    if parts.scheme in ("vmc", "vrchat") and "names" not in parts.options:
         plain += ("&" if "?" in plain else "?") + "names=own"
     return MappedSender(open_sender(plain, tuple(rules), fps), shapes)
 
@@ -62,7 +62,7 @@ class WeightStreams:
 
     def __init__(self, addresses: Sequence[str], names: Sequence[str], fps: float, say: Callable[[str], None]) -> None:
         self._say, self._sent = say, 0
-        self._senders: dict[str, WeightSender | MappedSender] = {}
+        self._senders: dict[str, FrameSender | MappedSender] = {}
         self._lost = dict.fromkeys(addresses, 0)
         self._said: dict[str, str] = {}
         with ExitStack() as opened:
