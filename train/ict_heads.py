@@ -1,4 +1,4 @@
-"""ICT-FaceKit's heads with blinks that shut the eyes and, at rest, lips that meet."""
+"""ICT-FaceKit's heads with blinks that shut the eyes, lips that meet at rest and teeth that an open mouth shows."""
 
 import torch
 from scipy import sparse
@@ -16,6 +16,7 @@ from torchface.optim.sparse import SparseCholesky
 
 _SKIN = ("face", "head_and_neck")
 _AROUND, _REACH, _FIRM = 40.0, 4.0, 100.0  # millimetres about the lips; over which skin goes along; of meeting lips
+_LONGER, _RAISED = 2.0, 4.0  # millimetres: upper teeth, and lower ones where the jaw opens
 
 
 def _skin(mesh: Mesh) -> Tensor:
@@ -67,3 +68,13 @@ def with_meeting_lips(mesh: Mesh, modes: Tensor) -> tuple[Mesh, Tensor]:
     change = system.solve(torch.from_numpy(-_FIRM * (apart.T @ (apart @ across))))
     whole[:, rows, 1:] += change.unflatten(1, (-1, 2)).permute(1, 0, 2)
     return mesh.with_vertices(whole[0].float()), whole[1:].float()
+
+
+def with_teeth_in_sight(rig: BlendshapeRig) -> BlendshapeRig:
+    """A rig whose open mouth shows teeth: ICT-FaceKit's lips hide all of both rows however far the jaw opens."""
+    jaw = rig.names.index("jawOpen")
+    vertices, deltas, teeth = rig.vertices.clone(), rig.deltas.clone(), region(rig.neutral, "teeth")
+    lower = teeth & (deltas[jaw, :, 1] < 0.1 * deltas[jaw, teeth, 1].amin())
+    vertices[teeth & ~lower, 1] -= _LONGER
+    deltas[jaw, lower, 1] += _RAISED
+    return BlendshapeRig(rig.neutral.with_vertices(vertices), deltas, rig.names)

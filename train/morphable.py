@@ -27,7 +27,7 @@ from .head_colors import fitted_colors
 from .head_figures import draw
 from .head_measures import card_text, cross_validated, head_quality, measured
 from .head_samples import Source, aligned_samples, gather, performers, registered, vertex_colored
-from .ict_heads import with_meeting_lips, with_shut_lids
+from .ict_heads import with_meeting_lips, with_shut_lids, with_teeth_in_sight
 from .model_cards import model_card
 from .model_quality import ModelQuality
 from .recipe_settings import RecipeSettings
@@ -230,11 +230,11 @@ def _source(settings: Settings) -> tuple[Source, int]:
 
 def ict_head_model(folder: Path, part: str | None = None, components: int | None = None) -> HeadModel:
     """The identity modes, all or some, of ICT-FaceKit's ``FaceXModel`` as a head model, or a part of it, with its
-    expressions; lips meet at rest, and blinks shut the eyes."""
+    expressions; lips meet at rest, blinks shut the eyes, and an open mouth shows teeth."""
     rig, modes = load_ict_facekit(folder), load_identity_modes(folder, components).deltas
     if rig.neutral.regions:  # ICT's topology
         neutral, modes = with_meeting_lips(rig.neutral, modes)
-        rig = with_shut_lids(BlendshapeRig(neutral, rig.deltas, rig.names))
+        rig = with_teeth_in_sight(with_shut_lids(BlendshapeRig(neutral, rig.deltas, rig.names)))
     deviations = modes.flatten(1).norm(dim=1)
     shape = MorphableModel(rig.vertices, modes / deviations[:, None, None], deviations)
     model = HeadModel.on(rig.neutral, shape, rig=rig)

@@ -94,10 +94,11 @@ def test_painted_irises_take_a_colour_and_nothing_else_does() -> None:
     assert float(texture[:, changed].mean(0).max()) < 0.72  # the whites stay
 
 
-def test_teeth_are_darker_the_further_back_they_lie() -> None:
+@pytest.mark.parametrize("part", ["teeth_upper", "gums_and_tongue", "mouth_socket"])
+def test_what_lies_in_the_mouth_is_darker_the_further_back_it_lies(part: str) -> None:
     head = performer(texture=False).neutral
     teeth = torch.arange(len(head.vertices)) % 3 == 0
-    head = replace(head, annotations=replace(head.annotations, regions={"teeth_upper": teeth}))
+    head = replace(head, annotations=replace(head.annotations, regions={part: teeth}))
     colored = with_part_colors(replace(head, colors=torch.ones(len(head.vertices), 3)), None)
     depth, light = head.vertices[teeth, 2], colored.colors[teeth].mean(1)
     order = depth.argsort(descending=True)

@@ -56,8 +56,10 @@ _GLASS, _GLASSES, _FRAMED = 0.3, 0.03, 0.5  # shares: of a place, of the places 
 # glasses 0.075, of 8 people without at most 0.02.
 _BRIDGE, _ON_BRIDGE, _OF_BRIDGE = 0.1, 0.1, 0.05
 _BROW_ENDS = 0.6, 0.95  # shares of skin between which hair of brows and beards ends
-# Lips and cheeks keep light from teeth: shares at the front and far back, and millimetres behind the foremost.
-_TEETH_LIGHT, _TEETH_BACK = (0.85, 0.3), (4.0, 28.0)
+# Lips and cheeks keep light from teeth, tongue and throat: shares at the front and far back, and millimetres behind the
+# foremost.
+_IN_MOUTH = "teeth", "gums_and_tongue", "mouth"
+_MOUTH_LIGHT, _MOUTH_BACK = (0.85, 0.3), (4.0, 28.0)
 _IRIS_COSINE = 0.9  # of the angle between the eye's axis and the border of an iris 11 mm wide
 
 
@@ -383,10 +385,10 @@ def with_part_colors(mesh: Mesh, iris: Tensor | None) -> Mesh:
         if material is None or not bool(mask.any()):
             continue
         colors[mask] = colors.new_tensor(material.color)
-        if material.name == "teeth":
+        if material.name in _IN_MOUTH:
             behind = mesh.vertices[mask, 2].max() - mesh.vertices[mask, 2]
-            share = ((behind - _TEETH_BACK[0]) / (_TEETH_BACK[1] - _TEETH_BACK[0])).clamp(0, 1)
-            light = _TEETH_LIGHT[0] + (_TEETH_LIGHT[1] - _TEETH_LIGHT[0]) * share
+            share = ((behind - _MOUTH_BACK[0]) / (_MOUTH_BACK[1] - _MOUTH_BACK[0])).clamp(0, 1)
+            light = _MOUTH_LIGHT[0] + (_MOUTH_LIGHT[1] - _MOUTH_LIGHT[0]) * share
             colors[mask] *= light[:, None].to(colors)
         if material is EYEBALL and iris is not None:
             ball = mesh.vertices[mask]
