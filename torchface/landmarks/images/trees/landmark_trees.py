@@ -197,7 +197,7 @@ class LandmarkTrees(nn.Module):
         first, second, thresholds = (x[cascade].flatten() for x in (self.first, self.second, self.thresholds))
         tree = torch.arange(self.sizes["trees"], device=first.device)
         splits, leaves = self.first.shape[2], self.leaves.shape[2]
-        node = torch.zeros(len(grey), len(tree), dtype=torch.int64, device=first.device)
+        node = torch.zeros(grey.shape[0], len(tree), dtype=torch.int64, device=first.device)
         for _ in range(self.sizes["depth"]):  # a level at a time, all trees of all faces together
             place = tree * splits + node
             difference = grey.gather(1, first[place]) - grey.gather(1, second[place])
@@ -231,4 +231,5 @@ def read_grey(images: Tensor, pixels: Tensor) -> Tensor:
     height, width = images.shape[2:]
     nearest = torch.nan_to_num(pixels).round()
     x, y = nearest[..., 0].clamp(0, width - 1).long(), nearest[..., 1].clamp(0, height - 1).long()
-    return images.flatten(1).expand(len(pixels), -1).gather(1, y * width + x)
+    # No len(): in torch.export's quick mode it makes the number of faces a constant, and the slow one follows.
+    return images.flatten(1).expand(pixels.shape[0], -1).gather(1, y * width + x)
