@@ -9,7 +9,6 @@ from torchface.geometry.cameras.pinhole import look_at
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import IDENTITY, performer
 
-FPS = 30
 _WALL = (0.3, 0.35, 0.4)
 _KEY = (0.0, 1.0, 0.0)  # behind a head that is put before a wall afterwards
 _SIDE = 150  # pixels a side of a head's picture
@@ -25,7 +24,7 @@ class CrossingFilm:
 
 def crossing_film(
     before: int = 20, hidden: float = 0.4, after: int = 20, tint: tuple[float, ...] = (0.5, 0.42, 0.4),
-    start: float = 240.0, end: float = 10.0, larger: float = 1.1, stays: float = 0.0,
+    start: float = 240.0, end: float = 10.0, larger: float = 1.1, stays: float = 0.0, fps: int = 30,
 ) -> CrossingFilm:  # fmt: skip
     """The first person sits still, alone at first; the second comes, passes in front and stays at the other side.
 
@@ -37,16 +36,17 @@ def crossing_film(
         start: left border of the second's picture at first, pixels, 400 for beyond the picture; ``end``, at last.
         larger: the second's head beside the first's.
         stays: seconds for which the second stands right before the first.
+        fps: frames a second.
     """
     first, column = _head(torch.zeros(len(IDENTITY)), (1.0, 1.0, 1.0), 1.0)
     person = torch.linspace(-1.5, 1.5, len(IDENTITY))
     second, _ = _head(person[torch.randperm(len(IDENTITY), generator=torch.Generator().manual_seed(1))], tint, larger)
     left = 120
     head = 100 * (1 + larger) / 2  # pixels: while it is nearer than that to the first, it covers it
-    step = 2 * head / (hidden * FPS)
+    step = 2 * head / (hidden * fps)
     there = left - _SIDE * (larger - 1) / 2
     passing = torch.arange(start, end, -step)
-    waiting = torch.full((round(stays * FPS),), there)
+    waiting = torch.full((round(stays * fps),), there)
     parts = [passing[passing >= there], waiting, passing[passing < there]]
     path = torch.cat([torch.full((before,), start), *parts, torch.full((after,), end)]).round()
     wall = (255 * torch.tensor(_WALL)).byte()[:, None, None].expand(3, 240, 1000)

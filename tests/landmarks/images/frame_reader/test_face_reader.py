@@ -225,7 +225,7 @@ def test_a_plain_wall_is_no_face_for_long(
         {"tint": (1.0, 1.0, 1.0)},
         {"hidden": 0.8},
         {"larger": 1.4},
-        {"stays": 5.0},
+        {"stays": 5.0, "fps": 15},
         {"stays": 2.0, "tint": (1.0, 1.0, 1.0)},
     ],
     ids=["beside", "passing", "alike", "slow", "near", "before", "alike before"],
@@ -234,10 +234,11 @@ def test_it_stays_with_a_person_before_whom_another_passes(reader: FaceReader, f
     """Reader and tracker alike: never for two frames with the other, soon with the first again; others are counted."""
     crossing = crossing_film(**film)
     network = zoo.get_model("landmark_network")
-    tracker = LandmarkTracker(CropFinder(network, network.size, network.margin), detector=shipped_detector())
+    fps = film.get("fps", 30)
+    tracker = LandmarkTracker(CropFinder(network, network.size, network.margin), detector=shipped_detector(), fps=fps)
     webcam, away = Webcam(reader), torch.zeros(2, len(crossing.frames))
     for i, frame in enumerate(crossing.frames):
-        for row, found in enumerate((webcam.step(frame), tracker.step(frame))):
+        for row, found in enumerate((webcam.step(frame, 1 / fps), tracker.step(frame))):
             away[row, i] = abs(float(found.landmarks[:, 0].mean()) - float(crossing.columns[i]))
     assert (away[:, :15] < 2).all()
     assert (away[:, -20:] < 2).all()
@@ -259,10 +260,10 @@ def test_one_of_two_boxes_that_overlap_is_not_mistaken_for_good() -> None:
 
 
 def test_who_stays_before_another_is_followed_in_the_end(webcam: Webcam) -> None:
-    frames = crossing_film(stays=10.0, after=0).frames
-    seen = [column(webcam.step(frame)) for frame in frames]
-    assert all(one != one for one in seen[40:180])
-    assert seen[-20] == seen[-20]
+    frames = crossing_film(stays=10.0, after=0, fps=10).frames
+    seen = [column(webcam.step(frame, 0.1)) for frame in frames]
+    assert all(one != one for one in seen[27:74])  # for five seconds
+    assert seen[-7] == seen[-7]
 
 
 def test_a_person_who_passes_before_another_is_kept(webcam: Webcam) -> None:
