@@ -59,6 +59,7 @@ def test_an_expression_of_a_person_is_named(
         assert " mm (" in note
 
 
+@pytest.mark.usefixtures("coarse_figures")
 def test_a_shape_that_is_found_can_be_taken_out(
     actor: BlendshapeRig, people: list[Mesh], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -78,6 +79,7 @@ def test_a_shape_that_is_found_can_be_taken_out(
     assert left.norm(dim=-1).max() < 0.15 * jaw.norm(dim=-1).max()
 
 
+@pytest.mark.usefixtures("coarse_figures")
 def test_a_pose_that_a_head_does_not_show_is_named(
     actor: BlendshapeRig, people: list[Mesh], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
