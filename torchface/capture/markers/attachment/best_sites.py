@@ -77,16 +77,14 @@ def best_sites(points: Tensor, faces: Tensor, candidates: Tensor, moments: PathM
     the affine maps (V,3,N+1) of the vertices. Source: thesis 4.1.2, algorithm 4, steps 4 and 5."""
     used, local = faces[candidates].unique(return_inverse=True)
     corner = (points[used] @ moments.factor).flatten(1)[local]
-    a = corner[:, :, 0]
-    ab, ac, ap = corner[:, :, 1] - a, corner[:, :, 2] - a, moments.path.flatten(1)[:, None] - a
-    ab2, ac2, abac, d1, d2, ap2 = ((x * y).sum(-1) for x, y in _pairs(ab, ac, ap))
+    corner[:, :, 1:] -= corner[:, :, :1]
+    corner[:, :, 0] -= moments.path.flatten(1)[:, None]
+    gram = corner @ corner.mT  # of pa, ab and ac, half the time of six sums
+    ap2, ab2, ac2 = gram.diagonal(dim1=-2, dim2=-1).unbind(-1)
+    d1, d2, abac = -gram[..., 0, 1], -gram[..., 0, 2], gram[..., 1, 2]
     v, w = triangle_coordinates(ab2, ac2, abac, d1, d2)
     squared = ap2 - 2 * (v * d1 + w * d2) + v * v * ab2 + w * w * ac2 + 2 * v * w * abac
     best = squared.argmin(1, keepdim=True)
     v, w, squared, triangles = (part.gather(1, best)[:, 0] for part in (v, w, squared, candidates))
     error = ((squared.clamp(min=0) + moments.residual) / moments.frames.clamp(min=1)).sqrt()
     return Sites(triangles, torch.stack([1 - v - w, v, w], dim=1), error)
-
-
-def _pairs(ab: Tensor, ac: Tensor, ap: Tensor) -> tuple[tuple[Tensor, Tensor], ...]:
-    return (ab, ab), (ac, ac), (ab, ac), (ab, ap), (ac, ap), (ap, ap)
