@@ -25,7 +25,7 @@ from torchface.modeling.photographs.skin_light import (
     unlit,
     unveiled,
 )
-from torchface.modeling.photographs.skin_mask import FacePlaces
+from torchface.modeling.photographs.skin_mask import FacePlaces, ShownParts
 from torchface.rendering.camera_visibility import PosedSurface
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import neutral_head
@@ -110,6 +110,25 @@ def test_shadow_beside_hair_is_not_painted_and_a_mole_is(head: Mesh, camera: Cam
     seen = PosedSurface.each(head, 1)[0].shown_in(picture, camera).cosine > 0.3
     assert float((found[border & seen] - SKIN).norm(dim=1).median()) < 0.1
     assert float((found[mole] - dark).norm(dim=1).min()) < 0.1
+
+
+def test_long_hair_beside_the_jaw_is_no_beard_and_a_beard_stays(head: Mesh, camera: Camera) -> None:
+    places = FacePlaces.of(head)
+    low = (places.place[:, 1] < -0.5) & (places.out < 1.3)
+    strand, beard = low & (places.out > 0.6) & (places.place[:, 0] > 0.25), low & (places.out > 0.6)
+    skin = low & (places.out < 1) & ~places.features & ~part_vertices(head) & (places.place[:, 0].abs() > 0.3)
+    graph, own = VertexGraph(head.faces, len(head.vertices)), []
+    for hair in (strand, beard):
+        shown = replace(head, colors=torch.where(hair[:, None], HAIR, head.colors))
+        picture = render(shown, camera, lighting=EVEN, samples=1)
+        parts = planted_parts(picture, {"hair": HAIR, "background": torch.zeros(3)}, 0.05)
+        own.append(ShownParts.of(parts, camera.project(head.vertices.double()), places, graph).own)
+        if hair is strand:
+            settings = FitSettings(texture_size=128, parts=[parts], paint_hair=False)
+            found = photographed_skin([head], None, [picture], [camera], settings).colors
+            assert float((found[skin] - SKIN).norm(dim=1).max()) < 0.1  # nor is it mirrored
+    inner = strand & (places.out < 0.9) & ~places.features & ~part_vertices(head)
+    assert float(own[0][inner].median()) < 0.1 < 0.9 < float(own[1][inner].median())
 
 
 def test_a_photographs_brows_are_the_only_ones(head: Mesh, camera: Camera) -> None:

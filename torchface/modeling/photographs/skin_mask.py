@@ -19,7 +19,8 @@ _FOREHEAD = 0.15
 _BROW, _FRINGE = 0.13, (0.16, 0.30)
 """In distances between the eyes' outer corners, but for the second row: shares of the way to the face's outline."""
 
-_HANGS = 0.1, 0.5  # shares of hair over the brows between which a fringe begins
+_HANGS = 0.1, 0.5  # shares of hair over the brows, and about the mouth, between which a fringe and a beard begin
+_CHIN, _FULLEST = 0.2, 0.95  # of the same distances, beside the middle; quantile
 
 _FRAMES = (0.05, 0.08, 0.36, 0.44)  # from the eyes' landmarks
 _LID, _LID_BROW, _RIM = (0.01, 0.03, 0.10, 0.15), (0.06, 0.10), (0.02, 0.05)
@@ -108,10 +109,14 @@ class ShownParts:
         fringe = ramp(
             hair[(above > _FRINGE[0]) & (above < _FRINGE[1]) & (places.out < 1)].mean().nan_to_num(1.0), *_HANGS
         )
-        grown = hair * ramp(_NOSE - places.place[:, 1], 0.0, 0.1) * (places.out < 1)
+        # A beard grows on the chin or over the lip too: hair that hangs beside a bare mouth comes from the head.
+        right, up, _ = places.place.T
+        mouth = hair[(right.abs() < _CHIN) & (up < _NOSE) & (places.out < 1)]
+        beard = ramp(mouth.quantile(_FULLEST), *_HANGS)
+        grown = hair * ramp(_NOSE - up, 0.0, 0.1) * (places.out < 1) * beard
         grown = torch.maximum(grown, hair * places.brow * (1 - fringe))
         # What lies beside hair is in its shadow, and between strands of a fringe is no skin to be painted.
-        over = places.place[:, 1] > _NOSE
+        over = torch.where(up > _NOSE, 1.0, 1 - beard)
         wide = replace(parts, shares=max_pool2d(parts.shares[None], _SHADOW, 1, _SHADOW // 2)[0])
         shaded = wide.at(pixels, "hair").double().nan_to_num(0.0) * over * (1 - (1 - fringe) * places.brow)
         wider = avg_pool2d(max_pool2d(parts.shares[None], _DOUBT, 1, _DOUBT // 2), _DOUBT, 1, _DOUBT // 2)[0]
