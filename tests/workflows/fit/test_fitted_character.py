@@ -68,7 +68,10 @@ def test_of_a_turned_face_the_near_side_counts(yaw: float) -> None:
 
 
 @pytest.mark.parametrize("colors", [True, False])
-def test_teeth_are_as_bright_as_photographed_and_grey_in_black_and_white(colors: bool) -> None:
+def test_teeth_are_as_bright_as_photographed_and_grey_in_black_and_white(
+    colors: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("torchface.workflows.fit.fitted_character._SIZE", 256)  # painting a skin takes seconds
     actor = performer(texture=False).select(["jawOpen"])
     number = torch.full((SIZE, SIZE), SKIN)
     number[90:100, 50:80] = PARTS.index("teeth")
