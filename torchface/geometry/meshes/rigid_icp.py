@@ -58,7 +58,7 @@ class ScanPoints:
 
     def __init__(self, points: Tensor, normals: Tensor, border: Tensor) -> None:
         self.points, self.normals, self.border = points, normals, border
-        self._tree = cKDTree(points.numpy())
+        self._tree = cKDTree(points.numpy(), leafsize=64)  # of 16 a query far from all points takes twice as long
 
     @staticmethod
     def of(vertices: Tensor, faces: Tensor, whole_border: bool = False) -> "ScanPoints":
