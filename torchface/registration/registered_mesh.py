@@ -91,8 +91,10 @@ def with_template_skin(mesh: Mesh, template: Mesh, hidden: Tensor) -> Mesh:
         texels = rasterise_uvs(mesh.uvs, mesh.uv_faces, height, width)
         inside = torch.zeros(height * width)
         inside[texels.texels[hidden[mesh.faces].all(1)[texels.triangles]]] = 1
-        seam = torch.nn.functional.max_pool2d(inside.view(1, 1, height, width), 2 * _SEAM + 1, 1, _SEAM)[0, 0] > 0
-        taken = (inside.view(height, width) > 0) | (seam & ~texels.mask())
+        seam = inside.view(1, height, width) > 0
+        for size, pad in (((2 * _SEAM + 1, 1), (_SEAM, 0)), ((1, 2 * _SEAM + 1), (0, _SEAM))):  # a square, in two
+            seam = torch.nn.functional.max_pool2d(seam.float(), size, 1, pad) > 0
+        taken = (inside.view(height, width) > 0) | (seam[0] & ~texels.mask())
         own = torch.nn.functional.interpolate(
             template.texture[None].to(texture), (height, width), mode="bilinear", align_corners=False, antialias=True
         )[0]

@@ -1,6 +1,8 @@
 """A mesh's vertices as a graph along its edges."""
 
+import numpy as np
 import torch
+from scipy.sparse import csr_matrix
 from torch import Tensor
 
 from torchface.geometry.meshes.operators import edges
@@ -24,18 +26,18 @@ class VertexGraph:
         if vertices is not None:
             edge = float((vertices[self.first] - vertices[self.second]).norm(dim=1).median())
             self.finer = min(max((_EDGE / max(edge, 1e-6)) ** 2, 1 / _FINEST), _FINEST)
-        degree = torch.zeros(count, dtype=torch.float64)
-        one = torch.ones(len(self.first), dtype=torch.float64)
-        self.degree = degree.index_add(0, self.first, one).index_add(0, self.second, one).clamp(min=1)
+        rows, columns = torch.cat([self.first, self.second]).numpy(), torch.cat([self.second, self.first]).numpy()
+        self._beside = csr_matrix((np.ones(len(rows)), (rows, columns)), (count, count))
+        self.degree = torch.from_numpy(self._beside.sum(1).A1).clamp(min=1)
 
     def rounds(self, iterations: int) -> int:
         """How many rounds reach as far as these on the performer's mesh."""
         return max(1, round(iterations * self.finer))
 
     def sum(self, values: Tensor, itself: bool = False) -> Tensor:
-        """Of the values (V,...) of each vertex's neighbours, and of the vertex itself if asked for, (V,...)."""
-        total = (values.clone() if itself else torch.zeros_like(values)).index_add_(0, self.first, values[self.second])
-        return total.index_add_(0, self.second, values[self.first])
+        """Of the values (V,) or (V,C) of each vertex's neighbours, and of the vertex itself if asked for."""
+        total = torch.from_numpy(self._beside @ values.numpy()).to(values)
+        return total + values if itself else total
 
     def smoothed(self, values: Tensor, weights: Tensor, iterations: int) -> Tensor:
         """Weighted means (V,C) over ever wider surroundings; where nothing has a weight, 0."""

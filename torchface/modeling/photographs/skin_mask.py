@@ -117,10 +117,11 @@ class ShownParts:
         grown = torch.maximum(grown, hair * places.brow * (1 - fringe))
         # What lies beside hair is in its shadow, and between strands of a fringe is no skin to be painted.
         over = torch.where(up > _NOSE, 1.0, 1 - beard)
-        wide = replace(parts, shares=max_pool2d(parts.shares[None], _SHADOW, 1, _SHADOW // 2)[0])
+        strands = parts.of("hair")[None]
+        wide = replace(parts, shares=max_pool2d(strands, _SHADOW, 1, _SHADOW // 2).expand_as(parts.shares))
         shaded = wide.at(pixels, "hair").double().nan_to_num(0.0) * over * (1 - (1 - fringe) * places.brow)
-        wider = avg_pool2d(max_pool2d(parts.shares[None], _DOUBT, 1, _DOUBT // 2), _DOUBT, 1, _DOUBT // 2)[0]
-        doubt = replace(parts, shares=wider).at(pixels, "hair").double().nan_to_num(0.0) * over
+        wider = avg_pool2d(max_pool2d(strands, _DOUBT, 1, _DOUBT // 2), _DOUBT, 1, _DOUBT // 2)
+        doubt = replace(parts, shares=wider.expand_as(parts.shares)).at(pixels, "hair").double().nan_to_num(0.0) * over
         seen = (bare * (1 - shaded) + features * (1 - shaded * (1 - features)) + grown) * falloff
         own = graph.smoothed(seen[:, None], torch.ones_like(bare), 2)[:, 0]
         return ShownParts(own, bare * falloff, hair - grown, doubt)
