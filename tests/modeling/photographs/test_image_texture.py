@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.geometry.cameras.pinhole import look_at
+from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.io.gltf.part_textures.iris_texture import painted_eye
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.landmarks.images.networks.part_network import PARTS
@@ -19,12 +20,14 @@ from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.image_texture import (
     _spectacles,
     _View,
+    _with_parts,
     part_vertices,
     photographed_skin,
     with_part_colors,
 )
 from torchface.modeling.photographs.skin_light import like_skin_around
 from torchface.modeling.photographs.skin_mask import FacePlaces
+from torchface.modeling.photographs.texture_projection import PhotoTexture
 from torchface.registration.scan_colors import own_colors
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import neutral_head, performer
@@ -92,6 +95,14 @@ def test_painted_irises_take_a_colour_and_nothing_else_does() -> None:
     colors = mesh.texture[:, changed]
     assert float((colors.median(1).values / colors.median(1).values.norm() - blue / blue.norm()).abs().max()) < 0.03
     assert float(texture[:, changed].mean(0).max()) < 0.72  # the whites stay
+
+
+def test_the_edge_of_a_painted_pupil_is_soft(bare: Mesh) -> None:
+    texels = rasterise_uvs(bare.uvs, bare.uv_faces, 1024, 1024)
+    blank = PhotoTexture(torch.ones(3, 1024, 1024), bare.colors, torch.ones(len(bare.vertices)), texels)
+    drawn = _with_parts(blank, bare.colors, bare, part_vertices(bare), torch.ones(3)).image.mean(0)
+    assert int((drawn < 0.05).sum()) > 20
+    assert int(((drawn > 0.06) & (drawn < 0.2)).sum()) > 10  # none where black ends at the next texel
 
 
 @pytest.mark.parametrize("part", ["teeth_upper", "gums_and_tongue", "mouth_socket"])
