@@ -131,6 +131,21 @@ def test_long_hair_beside_the_jaw_is_no_beard_and_a_beard_stays(head: Mesh, came
     assert float(own[0][inner].median()) < 0.1 < 0.9 < float(own[1][inner].median())
 
 
+def test_rims_that_touching_lips_hide_have_the_lips_colour(head: Mesh, camera: Camera) -> None:
+    red = torch.tensor([0.62, 0.24, 0.26])
+    lips = head.regions["upper_lip"] | head.regions["lower_lip"]
+    shown = replace(head, colors=torch.where(lips[:, None], red, head.colors))
+    picture = render(shown, camera, lighting=EVEN, samples=1)
+    parts = planted_parts(picture, {"lips": red, "background": torch.zeros(3)}, 0.05)
+    template, settings = replace(head, colors=None), FitSettings(texture_size=128, parts=[parts], paint_hair=False)
+    found = photographed_skin([template], None, [picture], [camera], settings).colors
+    at = head.vertices[head.landmarks[61:64]].double()
+    near = torch.cdist(head.vertices.double(), at).amin(1) < 4
+    hidden = near & lips & (PosedSurface.each(head, 1)[0].shown_in(picture, camera).cosine <= 0)
+    assert int(hidden.sum()) > 5
+    assert float((found[hidden] - red).norm(dim=1).median()) < 0.5 * float((SKIN - red).norm())
+
+
 def test_a_photographs_brows_are_the_only_ones(head: Mesh, camera: Camera) -> None:
     places = FacePlaces.of(head)
     fringe = places.place[:, 1] > places.brows + 0.12

@@ -22,6 +22,7 @@ _SHARP, _SLANT, _FADE = 3.0, 0.05, 0.5
 _BENDS = 8  # rounds by which the cosine is smoothed
 _FEATHER, _BROAD, _FILL = 6, 60, 400
 _TYPICAL, _SPARSE = 0.15, 0.05
+_LIPS = 6.0  # millimetres around their inner landmarks
 _HEAT_LOSS, _HEAT_LOSS_AT_MASK = 0.004, 0.01  # a ring of vertices, relative
 _MAX_GAIN = 4.0
 _DARK, _MAX_TONE = 0.05, 0.5
@@ -267,6 +268,13 @@ def _filled(mesh: Mesh, colors: Tensor, alpha: Tensor, base: Tensor | None, grap
     # Heat flows from what is covered; behind a mask it is lost.
     for _ in range(0 if bool(fixed.all()) else graph.rounds(_FILL)):
         under = torch.where(fixed, under, torch.lerp(graph.sum(under) / graph.degree[:, None], mean, lost))
+    marks = None if mesh.annotations is None else mesh.annotations.landmarks
+    if marks is not None and len(marks) == 68:  # lips that touch hide their rims, which are lips too
+        at = mesh.vertices.detach().cpu().double()
+        lips = torch.cdist(at, at[marks[60:].cpu()]).amin(1) < _LIPS
+        lips &= (at[:, 0] > at[marks[60], 0]) & (at[:, 0] < at[marks[64], 0])
+        seen = lips & (covered > 0.5)
+        under = torch.where((lips & ~seen)[:, None], colors[seen].median(0).values, under) if seen.any() else under
     return guess + (1 - covered)[:, None] * under
 
 
