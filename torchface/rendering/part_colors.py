@@ -12,17 +12,18 @@ from torchface.part_materials import EYEBALL, IRIS, part_material
 CLAY = (0.80, 0.72, 0.66)  # the colour of a mesh that brings none
 _PUPIL = (0.05, 0.04, 0.04)
 _IRIS_ANGLE, _PUPIL_ANGLE = 26.0, 10.0  # degrees from the way the eye looks
+_SOFT, _HARD = 4.0, 1e-6  # how wide their edges are: between rows of vertices hard ones are jagged
 
 
 def region_colors(mesh: Mesh) -> Tensor:
     """Colours (V,3) of vertices; eyes look ahead with iris and pupil, so that a glance shows."""
-    return _colors(mesh, mesh.vertices.cpu(), lambda mask: mask)
+    return _colors(mesh, mesh.vertices.cpu(), lambda mask: mask, _SOFT)
 
 
 def triangle_colors(mesh: Mesh) -> Tensor:
     """The same of triangles, (F,3)."""
     faces = mesh.faces.cpu()
-    return _colors(mesh, mesh.vertices.cpu()[faces].mean(1), lambda mask: mask[faces].all(1))
+    return _colors(mesh, mesh.vertices.cpu()[faces].mean(1), lambda mask: mask[faces].all(1), _HARD)
 
 
 def clear_triangles(mesh: Mesh) -> Tensor:
@@ -44,7 +45,7 @@ def without_clear_shells(mesh: Mesh) -> Mesh:
     return replace(mesh, faces=mesh.faces[kept], uv_faces=uv_faces, polygons=None)
 
 
-def _colors(mesh: Mesh, points: Tensor, inside: Callable[[Tensor], Tensor]) -> Tensor:
+def _colors(mesh: Mesh, points: Tensor, inside: Callable[[Tensor], Tensor], soft: float) -> Tensor:
     """Colours of points (N,3), of which those of a region, a mask of the vertices, are found so, (N,) bool."""
     colors = torch.tensor(CLAY).repeat(len(points), 1)
     for name, mask in mesh.regions.items():
@@ -53,9 +54,10 @@ def _colors(mesh: Mesh, points: Tensor, inside: Callable[[Tensor], Tensor]) -> T
             continue
         colors[members] = torch.tensor(material.color)
         if material is EYEBALL:
-            angle = torch.where(members, _off_axis(mesh.vertices[mask].cpu(), points), torch.inf)
-            colors[angle < _IRIS_ANGLE] = torch.tensor(IRIS.color)
-            colors[angle < _PUPIL_ANGLE] = torch.tensor(_PUPIL)
+            angle = _off_axis(mesh.vertices[mask].cpu(), points[members])[:, None]
+            for edge, color in ((_IRIS_ANGLE, IRIS.color), (_PUPIL_ANGLE, _PUPIL)):
+                beyond = ((angle - edge) / soft + 0.5).clamp(0, 1)
+                colors[members] = torch.lerp(torch.tensor(color), colors[members], beyond)
     return colors
 
 

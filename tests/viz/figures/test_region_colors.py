@@ -6,6 +6,7 @@ import torch
 
 from torchface.mesh import Annotations, Mesh
 from torchface.part_materials import EYEBALL
+from torchface.rendering.part_colors import region_colors
 from torchface.synthetic import performer
 from torchface.viz.figures.region_colors import as_seen
 
@@ -44,3 +45,13 @@ def test_eyes_with_texels_of_their_own_keep_them() -> None:
     mesh = three_sheets()
     inside = replace(mesh, uvs=0.3 * mesh.uvs)
     assert as_seen(inside) is inside
+
+
+def test_the_edges_of_an_eyes_iris_and_pupil_are_soft() -> None:
+    angle = torch.deg2rad(torch.arange(0.0, 360.0))
+    ring = torch.stack([angle.sin(), torch.zeros(360), angle.cos()], dim=1)
+    ball = torch.cat([ring, ring[:, [1, 0, 2]]])  # two great circles: as high as it is wide
+    everything = {"eyeball_left": torch.ones(720, dtype=torch.bool)}
+    colors = region_colors(Mesh(12 * ball, torch.tensor([[0, 1, 2]]), annotations=Annotations(None, everything)))
+    assert float(colors[:60].diff(dim=0).abs().max()) < 0.2  # a hard edge: 0.67
+    assert float(colors[0].max()) < 0.1 < 0.8 < float(colors[60].min())
