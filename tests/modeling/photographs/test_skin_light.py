@@ -131,6 +131,20 @@ def test_long_hair_beside_the_jaw_is_no_beard_and_a_beard_stays(head: Mesh, came
     assert float(own[0][inner].median()) < 0.1 < 0.9 < float(own[1][inner].median())
 
 
+@pytest.mark.parametrize("yaw", [30.0, 60.0])
+def test_long_hair_before_what_a_turned_head_hides_of_mouth_and_neck_is_no_beard(head: Mesh, yaw: float) -> None:
+    places = FacePlaces.of(head)
+    strand = (places.place[:, 1] < -0.5) & (places.out > 0.6) & (places.out < 1.3) & (places.place[:, 0] > 0.25)
+    shown = replace(head, colors=torch.where(strand[:, None], HAIR, head.colors))
+    camera = look_at(head.vertices[head.landmarks].mean(0), yaw, span=300.0, width=300, height=360)
+    picture = render(shown, camera, lighting=EVEN, samples=1)
+    parts = planted_parts(picture, {"hair": HAIR, "background": torch.zeros(3)}, 0.05)
+    graph = VertexGraph(head.faces, len(head.vertices))
+    own = ShownParts.of(parts, camera.project(head.vertices.double()), places, graph).own
+    inner = strand & (places.out < 0.9) & ~places.features & ~part_vertices(head)
+    assert float(own[inner].median()) < 0.1
+
+
 def test_rims_that_touching_lips_hide_have_the_lips_colour(head: Mesh, camera: Camera) -> None:
     red = torch.tensor([0.62, 0.24, 0.26])
     lips = head.regions["upper_lip"] | head.regions["lower_lip"]

@@ -20,7 +20,7 @@ _BROW, _FRINGE = 0.13, (0.16, 0.30)
 """In distances between the eyes' outer corners, but for the second row: shares of the way to the face's outline."""
 
 _HANGS = 0.1, 0.5  # shares of hair over the brows, and about the mouth, between which a fringe and a beard begin
-_CHIN, _FULLEST = 0.2, 0.95  # of the same distances, beside the middle; quantile
+_CHIN, _FULLEST = 0.2, 0.95  # of the same distances, beside the middle and behind the chin; quantile
 
 _FRAMES = (0.05, 0.08, 0.36, 0.44)  # from the eyes' landmarks
 _LID, _LID_BROW, _RIM = (0.01, 0.03, 0.10, 0.15), (0.06, 0.10), (0.02, 0.05)
@@ -110,8 +110,9 @@ class ShownParts:
             hair[(above > _FRINGE[0]) & (above < _FRINGE[1]) & (places.out < 1)].mean().nan_to_num(1.0), *_HANGS
         )
         # A beard grows on the chin or over the lip too: hair that hangs beside a bare mouth comes from the head.
-        right, up, _ = places.place.T
-        mouth = hair[(right.abs() < _CHIN) & (up < _NOSE) & (places.out < 1)]
+        # It lies before neck and gums too, where a turned head hides them.
+        right, up, front = places.place.T
+        mouth = hair[(right.abs() < _CHIN) & (up < _NOSE) & (places.out < 1) & (front > places.chin[2] - _CHIN)]
         beard = ramp(mouth.quantile(_FULLEST), *_HANGS)
         grown = hair * ramp(_NOSE - up, 0.0, 0.1) * (places.out < 1) * beard
         grown = torch.maximum(grown, hair * places.brow * (1 - fringe))
