@@ -56,7 +56,7 @@ def _colors(mesh: Mesh, points: Tensor, inside: Callable[[Tensor], Tensor], soft
         if material is EYEBALL:
             angle = _off_axis(mesh.vertices[mask].cpu(), points[members])[:, None]
             for edge, color in ((_IRIS_ANGLE, IRIS.color), (_PUPIL_ANGLE, _PUPIL)):
-                beyond = ((angle - edge) / soft + 0.5).clamp(0, 1)
+                beyond = ((angle - edge) / soft + 0.5).clamp(0, 1).to(colors)
                 colors[members] = torch.lerp(torch.tensor(color), colors[members], beyond)
     return colors
 
@@ -67,4 +67,4 @@ def _off_axis(eyeball: Tensor, points: Tensor) -> Tensor:
     middle = (low + high) / 2
     middle[2] = high[2] - (high[:2] - low[:2]).amax() / 2  # what is seen is a ball, behind it may be a nerve
     way = points - middle
-    return torch.rad2deg(torch.acos((way[:, 2] / way.norm(dim=1)).clamp(-1, 1)))
+    return torch.rad2deg(torch.acos((way[:, 2] / way.norm(dim=1)).nan_to_num(-1.0).clamp(-1, 1)))

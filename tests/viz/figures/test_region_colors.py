@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import pytest
 import torch
 
 from torchface.mesh import Annotations, Mesh
@@ -47,11 +48,13 @@ def test_eyes_with_texels_of_their_own_keep_them() -> None:
     assert as_seen(inside) is inside
 
 
-def test_the_edges_of_an_eyes_iris_and_pupil_are_soft() -> None:
-    angle = torch.deg2rad(torch.arange(0.0, 360.0))
-    ring = torch.stack([angle.sin(), torch.zeros(360), angle.cos()], dim=1)
-    ball = torch.cat([ring, ring[:, [1, 0, 2]]])  # two great circles: as high as it is wide
-    everything = {"eyeball_left": torch.ones(720, dtype=torch.bool)}
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
+def test_the_edges_of_an_eyes_iris_and_pupil_are_soft(dtype: torch.dtype) -> None:
+    angle = torch.deg2rad(torch.arange(0.0, 360.0, dtype=dtype))
+    ring = torch.stack([angle.sin(), torch.zeros_like(angle), angle.cos()], dim=1)
+    ball = torch.cat([ring, ring[:, [1, 0, 2]], torch.zeros_like(ring[:1])])  # great circles across, and the middle
+    everything = {"eyeball_left": torch.ones(len(ball), dtype=torch.bool)}
     colors = region_colors(Mesh(12 * ball, torch.tensor([[0, 1, 2]]), annotations=Annotations(None, everything)))
     assert float(colors[:60].diff(dim=0).abs().max()) < 0.2  # a hard edge: 0.67
     assert float(colors[0].max()) < 0.1 < 0.8 < float(colors[60].min())
+    assert torch.equal(colors[-1], colors[180])  # no way leads from the middle to the middle
