@@ -23,7 +23,7 @@ from torchface.modeling.photographs.skin_light import (
     skin_light,
     unlit,
 )
-from torchface.modeling.photographs.skin_mask import FacePlaces, ShownParts
+from torchface.modeling.photographs.skin_mask import FacePlaces, ShownParts, ramp
 from torchface.modeling.photographs.texture_fit import ColorFit, fit_colors
 from torchface.modeling.photographs.texture_projection import PhotoTexture, photo_texture
 from torchface.part_materials import EYEBALL, IRIS, part_material
@@ -42,7 +42,7 @@ _BROWS = 0.5  # share of a brow that photographs show
 # grow. Logarithms of colours by which shades of skin differ.
 _SCALP, _AS_DARK = (0.35, -0.3, -0.5), 0.12
 _FEWEST, _FILTERED = 3, 0.3  # photographs of which one is odd, by logarithms of its channels
-_PUPIL, _SOFT = 0.38, 0.1  # of the iris: the pupil, and how wide edges are
+_PUPIL, _SOFT = 0.38, 0.1  # of the iris: the pupil, and how wide edges are: texels are coarse
 _LID_SHADOW = 0.5  # of the eye's opening
 _TONE, _SEAM = 40, 16  # rounds over the mesh: the skin around, and the band in which what is completed begins
 _EVEN = 0.04, 0.10  # of a skin's brightness: what is added to it against shadows in even light at most, in shadows
@@ -341,18 +341,14 @@ def _with_parts(texture: PhotoTexture, colors: Tensor, mesh: Mesh, parts: Tensor
             aside = torch.where(at[:, 2] > 0, at[:, :2].norm(dim=1) / (0.5 * IRIS_WIDTH), torch.inf)[:, None]
             ringed = iris.double() * (1.1 - 0.5 * (aside.clamp(max=1) - 0.75).clamp(min=0) / 0.25)  # a dark rim
             white, black = painted.new_tensor(EYEBALL.color), torch.full_like(ringed, 0.04)
-            eye = torch.lerp(torch.lerp(black, ringed, _beyond(aside, _PUPIL)), white, _beyond(aside, 1.0))
+            beyond, outside = (ramp(aside, edge - _SOFT / 2, edge + _SOFT / 2) for edge in (_PUPIL, 1.0))
+            eye = torch.lerp(torch.lerp(black, ringed, beyond), white, outside)
             if _has_landmarks(mesh):
                 eye = eye * _under_lids(mesh, ball, at)[:, None]
             painted = torch.where(mask.cpu()[corners].all(1)[:, None], eye, painted)
     shown = texture.image.flatten(1)[:, texels.texels].T.double()
     part = parts[corners].all(1)[:, None]
     return replace(texture, image=texels.image(torch.where(part, painted, shown).clamp(0, 1)))
-
-
-def _beyond(aside: Tensor, edge: float) -> Tensor:
-    """0 inside an edge, 1 outside, soft between: texels are coarse."""
-    return ((aside - edge) / _SOFT + 0.5).clamp(0, 1)
 
 
 def _under_lids(mesh: Mesh, ball: Tensor, at: Tensor) -> Tensor:
