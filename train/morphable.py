@@ -19,6 +19,7 @@ from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.rigs.ict_facekit import region
 from torchface.mesh import submesh
 from torchface.modeling import HeadModel, MorphableModel
+from torchface.modeling.rigging.ict_heads import mended_head
 from torchface.progress import Progress
 from torchface.workflows.arkit.arkit_rig import published_head
 from torchface.zoo.model_folders import HOME
@@ -27,7 +28,6 @@ from .head_colors import fitted_colors
 from .head_figures import draw
 from .head_measures import card_text, cross_validated, head_quality, measured
 from .head_samples import Source, aligned_samples, gather, performers, registered, vertex_colored
-from .ict_heads import with_meeting_lips, with_shut_lids, with_teeth_in_sight
 from .model_cards import model_card
 from .model_quality import ModelQuality
 from .recipe_settings import RecipeSettings
@@ -232,9 +232,7 @@ def ict_head_model(folder: Path, part: str | None = None, components: int | None
     """The identity modes, all or some, of ICT-FaceKit's ``FaceXModel`` as a head model, or a part of it, with its
     expressions; lips meet at rest, blinks shut the eyes, and an open mouth shows teeth."""
     rig, modes = load_ict_facekit(folder), load_identity_modes(folder, components).deltas
-    if rig.neutral.regions:  # ICT's topology
-        neutral, modes = with_meeting_lips(rig.neutral, modes)
-        rig = with_teeth_in_sight(with_shut_lids(BlendshapeRig(neutral, rig.deltas, rig.names)))
+    rig, modes = mended_head(rig, modes)
     deviations = modes.flatten(1).norm(dim=1)
     shape = MorphableModel(rig.vertices, modes / deviations[:, None, None], deviations)
     model = HeadModel.on(rig.neutral, shape, rig=rig)

@@ -21,6 +21,7 @@ from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.io import load_mesh, load_rig, save_rig
 from torchface.io.maya.maya_writing import MAYA_ENDING
 from torchface.io.rig_files import check_rig_ending
+from torchface.io.rigs.ict_facekit import is_ict_folder
 from torchface.landmarks import AutomaticLandmarks, UVLandmarkDetector
 from torchface.mesh import Mesh
 from torchface.modeling import (
@@ -41,6 +42,7 @@ from torchface.modeling import (
     rig_from_examples,
     transfer_with_report,
 )
+from torchface.modeling.rigging.ict_heads import mended_head
 from torchface.modeling.rigging.neutral_check import pose_notes
 from torchface.modeling.rigging.part_clearance import penetration
 from torchface.modeling.rigging.part_placement import with_mouth_behind_skin, with_placed_parts
@@ -123,7 +125,7 @@ def rig_actor(
         raise FileFormatError(f"{out}: found detail maps ({detail}) for a .ma file, expected .glb or USD for them")
     options, progress = options or RigOptions(), progress or silent
     progress("reading the template")
-    rig = load_rig(template, part=options.part)
+    rig = load_template(template, options.part)
     shown = weights_row(options.pose, rig.names, "--pose") if options.pose else torch.zeros(len(rig.names))
     expressions = [] if examples is None else expressions_in(examples, rig.names)
     if examples is not None and not expressions:
@@ -196,6 +198,13 @@ def rig_actor(
         penetration(actor, parts),
         0 if predicted is None else int(predicted.learned.sum()),
     )
+
+
+def load_template(path: Path, part: str | None = None) -> BlendshapeRig:
+    """A template rig, or a part of it; of ICT-FaceKit's folder with lips that meet, blinks that shut, teeth in
+    sight."""
+    rig = load_rig(path, part=part)
+    return mended_head(rig)[0] if is_ict_folder(path) else rig
 
 
 def load_expressions(name_or_path: str | Path, template: BlendshapeRig, path: Path | None) -> ExpressionRegression:

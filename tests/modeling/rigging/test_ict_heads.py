@@ -10,9 +10,10 @@ from torch import Tensor
 from torchface import BlendshapeRig, Mesh
 from torchface.mesh import Annotations
 from torchface.modeling.rigging.eyelid_closure import BLINKS, SkinOfHead, eyes_seen, shut_blinks
+from torchface.modeling.rigging.ict_heads import mended_head, with_meeting_lips, with_shut_lids, with_teeth_in_sight
 from torchface.rendering.raycast import RayCaster
 from torchface.synthetic import performer
-from train.ict_heads import with_meeting_lips, with_shut_lids, with_teeth_in_sight
+from torchface.workflows.rig.actor_rig import load_template
 from train.morphable import ict_head_model
 
 
@@ -95,8 +96,11 @@ def seen(mesh: Mesh, vertices: Tensor, marks: slice, parts: tuple[str, ...], cle
 
 @pytest.mark.real
 def test_no_eyeball_shows_in_a_blink_and_teeth_in_an_open_mouth_but_not_at_rest(ict_folder: Path) -> None:
-    model = ict_head_model(ict_folder, components=6)
+    """Of the model of people, and of the template that ``rig`` puts on scans."""
+    model, template = ict_head_model(ict_folder, components=6), load_template(ict_folder)
     rig = model.rig
+    torch.testing.assert_close(template.deltas, rig.deltas)
+    torch.testing.assert_close(template.vertices, rig.vertices)
     mesh = rig.neutral
     films = ("lacrimal", "eye_blend", "eye_occlusion", "eyelashes")
     clear = torch.stack([mask for name, mask in mesh.regions.items() if name.startswith(films)]).any(0)
@@ -108,3 +112,10 @@ def test_no_eyeball_shows_in_a_blink_and_teeth_in_an_open_mouth_but_not_at_rest(
     for seed in range(3):
         a = torch.randn(6, generator=torch.Generator().manual_seed(seed))
         assert seen(mesh, model(a[None]).vertices[0], slice(60, 68), ("teeth", "mouth_socket"), clear) < 5
+
+
+def test_a_part_of_a_head_stays_as_it_is(actor: BlendshapeRig) -> None:
+    """The performer has no teeth of that name, and `rig --part face` keeps no eyes."""
+    modes = torch.ones(2, *actor.vertices.shape)
+    assert mended_head(actor, modes) == (actor, modes)
+    assert mended_head(actor)[1].shape == (0, *actor.vertices.shape)

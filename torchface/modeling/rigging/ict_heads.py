@@ -5,18 +5,31 @@ from scipy import sparse
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from torchface import BlendshapeRig, Mesh
 from torchface.geometry.meshes.contact import ContactFinder
 from torchface.geometry.meshes.operators import vertex_areas
 from torchface.geometry.meshes.shell_energies import stretching_energy
 from torchface.io.rigs.ict_facekit import region
+from torchface.mesh import Mesh
 from torchface.modeling.rigging.eyelid_closure import SkinOfHead, eyes_seen, shut_blinks
 from torchface.modeling.rigging.lid_and_lip_closing import REST_REACH
 from torchface.optim.sparse import SparseCholesky
+from torchface.rig import BlendshapeRig
 
 _SKIN = ("face", "head_and_neck")
+_SHAPES = ("eyeBlink_L", "eyeBlink_R", "jawOpen")
 _AROUND, _REACH, _FIRM = 40.0, 4.0, 100.0  # millimetres about the lips; over which skin goes along; of meeting lips
 _LONGER, _RAISED = 2.0, 4.0  # millimetres: upper teeth, and lower ones where the jaw opens
+
+
+def mended_head(rig: BlendshapeRig, modes: Tensor | None = None) -> tuple[BlendshapeRig, Tensor]:
+    """ICT-FaceKit's whole head and modes of heads (K,V,3) with lips that meet, blinks that shut and teeth in sight; a
+    part of it, or a head without these shapes, as it is."""
+    modes = rig.deltas[:0] if modes is None else modes
+    whole = {*_SKIN, "teeth", "eyeball_left", "eyeball_right"} <= set(rig.neutral.regions)
+    if not whole or not set(_SHAPES) <= set(rig.names):
+        return rig, modes
+    neutral, modes = with_meeting_lips(rig.neutral, modes)
+    return with_teeth_in_sight(with_shut_lids(BlendshapeRig(neutral, rig.deltas, rig.names))), modes
 
 
 def _skin(mesh: Mesh) -> Tensor:
