@@ -117,18 +117,23 @@ def test_long_hair_beside_the_jaw_is_no_beard_and_a_beard_stays(head: Mesh, came
     low = (places.place[:, 1] < -0.5) & (places.out < 1.3)
     strand, beard = low & (places.out > 0.6) & (places.place[:, 0] > 0.25), low & (places.out > 0.6)
     skin = low & (places.out < 1) & ~places.features & ~part_vertices(head) & (places.place[:, 0].abs() > 0.3)
-    graph, own = VertexGraph(head.faces, len(head.vertices)), []
-    for hair in (strand, beard):
+    moustache = (places.place[:, :2] - places.place[head.landmarks[[33, 51]], :2].mean(0)).norm(dim=1) < 0.1
+    moustache &= places.out < 1
+    graph, all_shown = VertexGraph(head.faces, len(head.vertices)), []
+    for hair in (strand, beard, moustache):
         shown = replace(head, colors=torch.where(hair[:, None], HAIR, head.colors))
         picture = render(shown, camera, lighting=EVEN, samples=1)
         parts = planted_parts(picture, {"hair": HAIR, "background": torch.zeros(3)}, 0.05)
-        own.append(ShownParts.of(parts, camera.project(head.vertices.double()), places, graph).own)
+        all_shown.append(ShownParts.of(parts, camera.project(head.vertices.double()), places, graph))
         if hair is strand:
             settings = FitSettings(texture_size=128, parts=[parts], paint_hair=False)
             found = photographed_skin([head], None, [picture], [camera], settings).colors
             assert float((found[skin] - SKIN).norm(dim=1).max()) < 0.1  # nor is it mirrored
     inner = strand & (places.out < 0.9) & ~places.features & ~part_vertices(head)
-    assert float(own[0][inner].median()) < 0.1 < 0.9 < float(own[1][inner].median())
+    assert float(all_shown[0].own[inner].median()) < 0.1 < 0.9 < float(all_shown[1].own[inner].median())
+    assert float(all_shown[0].doubt[inner].median()) > 0.9 > 0.1 > float(all_shown[1].doubt[inner].median())
+    grown = moustache & (places.place[:, 2] > places.chin[2]) & (places.place[:, 1] < -0.55)
+    assert float(all_shown[2].own[grown].median()) > 0.9
 
 
 @pytest.mark.parametrize("yaw", [30.0, 60.0])
