@@ -8,7 +8,7 @@ from torch import Tensor
 
 from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.mesh import Mesh
-from torchface.registration import register
+from torchface.registration import register, with_template_skin
 from torchface.registration.scan_colors import skin_base, with_edge_of_hair
 
 
@@ -132,3 +132,16 @@ def test_what_is_unseen_has_the_templates_texture_in_the_tone_of_the_skin_alone(
     base = skin_base(colors, template, seen)
     assert float((base[:count][~place[:count]] - 0.6).abs().max()) < 0.01
     assert float((base[place] - 0.15).abs().max()) < 0.01
+
+
+def test_a_templates_texture_reaches_a_seam_beyond_the_hidden_part_to_all_sides() -> None:
+    corners = torch.tensor([[0.25, 0.25], [0.75, 0.25], [0.75, 0.75], [0.25, 0.75]])
+    faces = torch.tensor([[0, 1, 2], [0, 2, 3]])
+    square = Mesh(
+        torch.nn.functional.pad(corners, (0, 1)), faces, uvs=corners, uv_faces=faces, texture=torch.zeros(3, 32, 32)
+    )
+    white = replace(square, texture=torch.ones(3, 32, 32))
+    taken = with_template_skin(square, white, torch.ones(4, dtype=torch.bool)).texture[0].nonzero()
+    assert taken.amin(0).tolist() == [4, 4]
+    assert taken.amax(0).tolist() == [27, 27]
+    assert len(taken) == 24 * 24
