@@ -17,7 +17,8 @@ def check_labels(found: Sequence[str], known: Sequence[str]) -> None:
         shown = ", ".join(map(repr, unknown[:5])) or "no marker at all"
         raise NameMismatchError(
             f"markers: found {shown}{' and others' if len(unknown) > 5 else ''}, expected labels of the attachment: "
-            f"{', '.join(known[:5])}, ...; drop markers that are not of the face with Track.select"
+            f"{', '.join(known[:5])}, ...; torchface.capture.markers.match_labels finds them without a subject's "
+            "prefix (Actor:M001) and in another case; drop markers that are not of the face with Track.select"
         )
 
 
