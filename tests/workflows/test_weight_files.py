@@ -273,3 +273,13 @@ def test_eyes_turn_in_live_link_as_the_weights_say(tmp_path: Path, dome_rig: Ble
     own = {name: torch.full((2,), 0.1).double() for name in ROTATIONS}
     write_weights(replace(take, extras={"columns": own}), WeightFiles(tmp_path / "own.csv"), dome_rig)
     assert torch.allclose(load_take(tmp_path / "own.csv").extras["columns"]["LeftEyeYaw"], own["LeftEyeYaw"])
+
+
+def test_a_whole_shape_comes_back_from_live_links_two_halves(dome_rig: BlendshapeRig, tmp_path: Path) -> None:
+    names = ("mouthSmile", "browInnerUp_L", "browInnerUp_R", "ctrl")
+    rig = BlendshapeRig(dome_rig.neutral, dome_rig.deltas, names)
+    take = Take(60.0, weights=Track(names, torch.rand(30, 4, 1)))
+    (warning,), _ = write_weights(take, WeightFiles(tmp_path / "out.csv", live_link=tmp_path / "live.csv"), rig)
+    assert warning.endswith(": browInnerUp_L, browInnerUp_R, ctrl")
+    back = rig.weights_from(load_take(tmp_path / "live.csv").weights)
+    torch.testing.assert_close(back[:, 0], take.weights.values[:, 0, 0])

@@ -172,6 +172,9 @@ def write_weights(
         if files.live_link is not None:
             make_folder(files.live_link.parent)
             save_live_link(with_eyes(few, rig), files.live_link)
+    names = take.weights.names
+    rows = (mapping(ARKIT, names) @ mapping(names, ARKIT)).tolist()  # a whole shape comes back from its two halves
+    lost = tuple(name for i, name in enumerate(names) if rows[i] != [float(i == k) for k in range(len(names))])
     if lost and files.live_link is not None:
         warnings.append(f"{files.live_link} does not give back (halves are merged, others left out): {listed(lost)}")
     if files.animation is not None:
