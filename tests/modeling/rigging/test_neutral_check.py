@@ -105,6 +105,14 @@ def test_the_templates_own_expression_is_named_with_its_weights(actor: Blendshap
     assert "--pose mouthSmileLeft=1.0 mouthSmileRight=1.0 takes" in note or "mouthSmileRight=1.0 mouthSmileLeft" in note
 
 
+def test_a_shape_that_moves_one_vertex_is_named(actor: BlendshapeRig) -> None:
+    deltas = torch.zeros(1, len(actor.vertices), 3)
+    deltas[0, actor.neutral.landmarks[8], 1] = -20.0
+    template = BlendshapeRig(actor.neutral, deltas, ("jawOpen",))
+    (note,) = neutral_notes(template, actor.neutral.with_vertices(actor.vertices + deltas[0]))
+    assert "jawOpen=1.0" in note
+
+
 def test_shapes_that_make_another_person_are_no_expressions(actor: BlendshapeRig) -> None:
     vertices, tip = actor.vertices, actor.vertices[actor.vertices[:, 2].argmax()]
     away = (vertices - tip).norm(dim=1, keepdim=True)
