@@ -283,3 +283,14 @@ def test_a_whole_shape_comes_back_from_live_links_two_halves(dome_rig: Blendshap
     assert warning.endswith(": browInnerUp_L, browInnerUp_R, ctrl")
     back = rig.weights_from(load_take(tmp_path / "live.csv").weights)
     torch.testing.assert_close(back[:, 0], take.weights.values[:, 0, 0])
+
+
+def test_markers_that_no_frame_shows_are_named(stage: Path, solve: Said, messages_of: Said, tmp_path: Path) -> None:
+    assert "no frame shows" not in solve("own")
+    take = load_take(stage / "take.c3d").markers
+    hidden, absent = take.names[3], take.names[8]
+    take.values[:, 3] = torch.nan
+    save_take(Take(60.0, markers=take.select([name for name in take.names if name != absent])), tmp_path / "take.c3d")
+    files = (stage / "own.glb", tmp_path / "take.c3d", "--attachment", stage / "attachment.json")
+    warned = messages_of("solve", *files, "--quiet", "--out", tmp_path / "out.csv")
+    assert f"no frame shows {hidden}, {absent}, of the attachment's" in warned

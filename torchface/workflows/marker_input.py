@@ -80,7 +80,12 @@ def read_markers(path: Path, labels: Sequence[str] | None, options: MarkerOption
     chosen = take.markers.select(match.channels)
     values = chosen.values if options.flip is None else _flipped(chosen.values, options.flip)
     markers, extras = Track(match.labels, values, chosen.confidence), {**take.extras, "flipped": options.flip}
-    return replace(take, markers=markers, extras=extras), match.notes()
+    notes, shown = match.notes(), torch.isfinite(values).all(-1).any(0).tolist()
+    seen = {name for name, is_shown in zip(match.labels, shown, strict=True) if is_shown}
+    never = [label for label in labels or () if label not in seen]
+    if never:
+        notes.append(f"no frame shows {listed(never)}, of the attachment's {len(labels or ())} markers")
+    return replace(take, markers=markers, extras=extras), notes
 
 
 def _flipped(values: Tensor, axis: str) -> Tensor:
