@@ -12,7 +12,7 @@ from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import Similarity
 from torchface.synthetic import performer
 from torchface.synthetic.stages import StageFlaws, perform, place_markers, record
-from torchface.workflows.solve.solution import Solution, SolveSettings, solve_markers
+from torchface.workflows.solve.solution import Solution, SolveReport, SolveSettings, solve_markers
 
 Capture = tuple[BlendshapeRig, Attachment, list[Tensor]]
 BENCH = pytest.mark.bench
@@ -92,6 +92,23 @@ def moving(take: Take, turn: float, way: float) -> Take:
     moved = (values - middle) @ turned.transpose(1, 2) + middle
     moved = moved + way * torch.stack([phase.sin(), 0 * phase, (2 * phase).cos()], 1)[:, None]
     return replace(take, markers=Track(take.markers.names, moved))
+
+
+def test_shapes_that_markers_hardly_see_are_named(stage: Capture) -> None:
+    """Thirty markers, none on a lid: eyes' shapes are named, and their weights are off by nearly all that they are."""
+    rig, _, takes = stage
+    sites = place_markers(rig, 30)
+    take = record(rig, sites, takes[0], torch.Generator().manual_seed(0), StageFlaws(noise=0.3)).take
+    solution = solve_markers(rig, sites, take, SolveSettings())
+    error, usual = (one.square().mean(0).sqrt() for one in (solution.weights - takes[0], takes[0]))
+    moved = usual > 0.1
+    named = torch.tensor([name in solution.unseen for name in rig.names])
+    assert {"eyeBlinkLeft", "eyeSquintRight"} & set(rig.names) <= set(solution.unseen)
+    assert not {"jawOpen", "mouthSmileLeft", "browInnerUp"} & set(solution.unseen)
+    assert float((error / usual)[named & moved].median()) > 0.8
+    assert float((error / usual)[~named & moved].median()) < 0.5
+    line = next(one for one in SolveReport(solution, 1.0, 1.0).lines() if "hardly see" in one)
+    assert all(name in line for name in solution.unseen[:3])
 
 
 @pytest.mark.parametrize(("turn", "way", "free"), [(0.9, 60.0, False), (0.9, 200.0, True), (0.12, 200.0, False)])

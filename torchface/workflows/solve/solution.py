@@ -40,6 +40,8 @@ from torchface.workflows.solve.take_check import (
 # A take is cleaned again where its alignment moves a site farther after the first cleaning, mm.
 _REALIGNED = 0.1
 _MOST = 0.8  # of the samples, below which a take shows too little
+# Millimetres of a coordinate; a usual weight; how much of it is left open of a shape that markers hardly see.
+_LEAST_NOISE, _USUAL_WEIGHT, _UNSEEN = 0.1, 0.3, 0.8
 _STRAY = 8.0  # times the median distance: noise stays below it, spikes and exchanged labels do not
 _SHOWN_DEFECTS = 12
 
@@ -113,6 +115,17 @@ class Solution:
             f"spikes and exchanged labels spoil the weights of the frames around them, too: {advice}"
         ]
 
+    @cached_property
+    def unseen(self) -> tuple[str, ...]:
+        """Shapes whose weight in a frame these markers, with the error that they have, determine hardly better than
+        nothing does."""
+        sites = self.attachment.on(self.rig.neutral.faces, self.rig.deltas.detach().double()).flatten(1)
+        noise = max(float(self.rmse.nanmedian()) / 3**0.5, _LEAST_NOISE)
+        precision = sites @ sites.T / noise**2 + torch.eye(len(sites), dtype=sites.dtype) / _USUAL_WEIGHT**2
+        deviation = torch.linalg.inv(precision).diagonal().sqrt()
+        names = zip(self.rig.names, (deviation > _UNSEEN * _USUAL_WEIGHT).tolist(), strict=True)
+        return tuple(name for name, hidden in names if hidden)
+
     @property
     def rmse(self) -> Tensor:
         """Marker RMSE a frame, (T,), millimetres."""
@@ -163,6 +176,10 @@ class SolveReport:
             f"marker RMSE: median {float(rmse.nanmedian()):.3f} mm, "
             f"95th percentile {float(rmse.nanquantile(0.95)):.3f} mm, worst {worst:.3f} mm"
         )
+        filmed = () if self.predicted is None else self.predicted.gamma.names
+        unseen = [name for name in solution.unseen if name not in filmed]
+        if unseen:
+            lines.append(f"shapes that these markers hardly see, whose weights are uncertain: {listed(unseen)}")
         lines.append(f"solved in {self.seconds:.2f} s, {1000 * self.seconds / max(frames, 1):.3f} ms a frame")
         if solution.motion is not None:
             lines.append(f"helmet or head: moved by up to {solution.motion.extent()}; not in the weights")
