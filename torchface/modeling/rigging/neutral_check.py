@@ -104,7 +104,7 @@ class _EdgeFit:
     def __init__(self, template: BlendshapeRig, rest: Tensor, goal: Tensor) -> None:
         deltas = template.deltas.detach().cpu().double()
         ends = edges(template.neutral.faces.cpu())
-        ends = ends[deltas.any(-1).any(0)[ends].any(1)]  # most edges stay: a third of the time
+        ends = ends[deltas.any(-1).any(0)[ends].any(1)]  # others say nothing, and cost memory
         root = rest[ends].diff(dim=1)[:, 0].norm(dim=-1).clamp(min=_SHORTEST * extent(rest)).sqrt()[:, None]
         shapes = deltas.index_select(1, ends[:, 1]).sub_(deltas.index_select(1, ends[:, 0])).div_(root)
         acts = shapes.any(-1).any(0)

@@ -121,7 +121,8 @@ class Solution:
         nothing does."""
         sites = self.attachment.on(self.rig.neutral.faces, self.rig.deltas.detach().double()).flatten(1)
         noise = max(float(self.rmse.nanmedian()) / 3**0.5, _LEAST_NOISE)
-        precision = sites @ sites.T / noise**2 + torch.eye(len(sites), dtype=sites.dtype) / _USUAL_WEIGHT**2
+        precision = sites @ sites.T / noise**2
+        precision.diagonal().add_(1 / _USUAL_WEIGHT**2)
         deviation = torch.linalg.inv(precision).diagonal().sqrt()
         names = zip(self.rig.names, (deviation > _UNSEEN * _USUAL_WEIGHT).tolist(), strict=True)
         return tuple(name for name, hidden in names if hidden)
