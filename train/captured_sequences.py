@@ -1,6 +1,7 @@
 """A captured performance as files hold it: sequences of frames of one topology, gathered into one file on disk."""
 
 import re
+import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
@@ -13,14 +14,16 @@ from torch import Tensor
 from torchface import Mesh, load_mesh
 from torchface.errors import FileFormatError, TopologyError, ValueRangeError
 from torchface.files.content_keys import content_key
+from torchface.files.whole_files import numbered_order
 from torchface.io import MeshSequence, MeshSequenceWriter
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.progress import Progress
 from torchface.synthetic.stages.weight_curves import GESTURES
 from torchface.synthetic.stages.wrinkles import WrinkledPerformer
-from torchface.workflows.animated_meshes import load_animated, meshes_over_time
+from torchface.workflows.animated_meshes import AnimatedMesh, load_animated, meshes_over_time
+from torchface.workflows.enhance.coarse_input import at_even_rate
 
-_METHOD = "captured sequences/1"
+_METHOD = "captured sequences/2"
 _NEUTRAL = "neutral"
 _ANIMATIONS = (".glb", ".gltf", ".safetensors", ".npz")
 _BLOCK = 8  # frames that are read at a time
@@ -90,10 +93,12 @@ def read_capture(folder: Path, neutral: Path | None) -> Capture:
     entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
     rest = _neutral_file(folder, entries) if neutral is None else neutral
     used = [entry for entry in entries if entry != rest]
-    sequences = [_animated(entry) for entry in used if entry.is_dir() or entry.suffix.lower() in _ANIMATIONS]
+    sequences = [
+        _sequence(load_animated(entry)) for entry in used if entry.is_dir() or entry.suffix.lower() in _ANIMATIONS
+    ]
     loose = [entry for entry in used if entry.is_file() and entry.suffix.lower() in MESH_ENDINGS]
     for name, files in groupby(loose, lambda file: _NUMBER.sub("", file.stem)):
-        sequences.append(_of_meshes(name, list(files)))
+        sequences.append(_sequence(meshes_over_time(Path(name), sorted(files, key=numbered_order), None)))
     if not sequences:
         raise FileFormatError(
             f"{folder}: found no sequences, expected folders of meshes, {', '.join(_ANIMATIONS)} files or meshes "
@@ -200,14 +205,11 @@ def _bare(name: str) -> str:
     return Path(name).stem if name.lower().endswith(_ANIMATIONS) else name
 
 
-def _animated(path: Path) -> CapturedSequence:
-    found = load_animated(path)
-    return CapturedSequence(path.name, found.count, found.read, found.neutral.faces, found.colors, found.fps)
-
-
-def _of_meshes(name: str, files: list[Path]) -> CapturedSequence:
-    animated = meshes_over_time(Path(name), files, None)
-    return CapturedSequence(name, animated.count, animated.read, animated.neutral.faces, colors=animated.colors)
+def _sequence(animated: AnimatedMesh) -> CapturedSequence:
+    found, notes = at_even_rate(animated, None)
+    for note in notes:
+        warnings.warn(note.removeprefix("warning: "), stacklevel=3)
+    return CapturedSequence(found.path.name, found.count, found.read, found.neutral.faces, found.colors, found.fps)
 
 
 def _gesture(

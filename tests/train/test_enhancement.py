@@ -70,6 +70,25 @@ def test_all_forms_of_sequences_are_read_alike(folder):
         assert torch.allclose(found[name].read(2, 7), frames(kind)[2:7], atol=1e-4)
 
 
+def test_frames_follow_their_numbers_and_lost_ones_are_told(folder):
+    for old in sorted(folder.glob("c_*.obj")):
+        old.rename(folder / f"c_{int(old.stem[2:]) + 3}.obj")  # c_3 to c_11
+    (folder / "a" / "004.ply").unlink()
+    with pytest.warns(UserWarning, match="a: 1 of 9 frames are missing, first from 003.ply to 005.ply"):
+        found = {sequence.name: sequence for sequence in read_capture(folder, None).sequences}
+    assert torch.allclose(found["c"].read(0, 9), frames(2), atol=1e-4)
+
+
+def test_an_animation_of_uneven_times_is_learned_at_an_even_rate(folder):
+    mesh, times = sheet(), torch.tensor([0.0, 1, 2, 3, 4, 6, 8, 10, 12]) / 24
+    rig = BlendshapeRig(mesh, frames(1)[4:5] - mesh.vertices, ("bump",))
+    bump = Track(("bump",), torch.linspace(0, 1, 9)[:, None, None])
+    save_animation(rig, Take(24.0, weights=bump, seconds=times), folder / "e.glb")
+    with pytest.warns(UserWarning, match="e.glb: found 9 frames .*; brought to 13 at an even 24 a second"):
+        found = {sequence.name: sequence for sequence in read_capture(folder, None).sequences}["e.glb"]
+    assert (found.count, found.fps) == (13, 24)
+
+
 def test_a_model_is_learned_measured_saved_and_drawn(folder, monkeypatch):
     monkeypatch.setattr(face_views, "render", lambda mesh, camera, *a, **k: torch.zeros(3, camera.height, camera.width))
     model = train(settings(folder))

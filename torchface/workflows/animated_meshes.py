@@ -54,7 +54,7 @@ class AnimatedMesh:
     rig: BlendshapeRig | None = None  # of its topology, where one came with it
     take: Take | None = None  # of the weights, where there is one, with the times of its frames
     numbered: bool = False  # whether its frames are numbered from a beginning that others may share
-    missing: str = ""  # which frames of a folder are not there, for people to read; empty where none is known to be
+    missing: str = ""  # which frames of meshes are not there, for people to read; empty where none is known to be
     # Of the vertices, (t,V,3) in [0,1], read as read does, where meshes have them.
     colors: Callable[[int, int], Tensor] | None = None
 
@@ -211,7 +211,7 @@ def _of_folder(folder: Path, rig: BlendshapeRig | None, unit: str | None) -> Ani
     files = sorted(meshes, key=numbered_order)
     if not files:
         raise FileFormatError(f"{folder}: found no mesh, expected files ending in {', '.join(MESH_ENDINGS)} or .glb")
-    return replace(meshes_over_time(folder, files, rig, unit), missing=_missing(files))
+    return meshes_over_time(folder, files, rig, unit)
 
 
 def _missing(files: list[Path]) -> str:
@@ -247,7 +247,8 @@ def meshes_over_time(path: Path, files: list[Path], rig: BlendshapeRig | None, u
         return torch.stack([row for row in found if row is not None])
 
     shades = None if first.colors is None else colors
-    return AnimatedMesh(path, _at_rest(path, first, rig), len(files), read, rig=rig, colors=shades)
+    neutral, missing = _at_rest(path, first, rig), _missing(files)
+    return AnimatedMesh(path, neutral, len(files), read, rig=rig, missing=missing, colors=shades)
 
 
 def _at_rest(path: Path, mesh: Mesh, rig: BlendshapeRig | None) -> Mesh:

@@ -164,6 +164,14 @@ def test_uneven_times_are_brought_to_an_even_rate_and_said(actor: Actor, tmp_pat
         torch.testing.assert_close(frames[0], frames[1], atol=2e-2, rtol=0)
 
 
+def test_lost_meshes_of_a_folder_are_told(actor: Actor, tmp_path: Path) -> None:
+    (tmp_path / "meshes").mkdir()
+    for t in (0, 1, 2, 5):
+        save_mesh(Mesh(actor.frames[t], actor.mesh.faces), tmp_path / "meshes" / f"f{t}.ply")
+    notes = coarse(actor, tmp_path / "meshes", tmp_path).notes
+    assert "warning: meshes: 2 of 6 frames are missing, first from f2.ply to f5.ply" in notes
+
+
 @pytest.mark.parametrize("ending", ["csv", "json"])
 def test_pairs_lay_another_topology_on_the_model(actor: Actor, tmp_path: Path, ending: str) -> None:
     order, faces = shuffled(actor)

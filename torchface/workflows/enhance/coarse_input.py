@@ -58,7 +58,7 @@ def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, p
         if value is not None:
             raise ValueRangeError(f"{path}: found {name} and no markers, expected a .c3d, .trc or .csv of markers")
     source = tracked_animation(path)
-    animated, notes = _even(load_animated(source, settings.rig, settings.part, options.unit), settings.fps)
+    animated, notes = at_even_rate(load_animated(source, settings.rig, settings.part, options.unit), settings.fps)
     if settings.rig is not None and animated.take is not None and source.suffix.lower() in SCENE_ENDINGS:
         notes = [*notes, f"warning: --rig {settings.rig} is not used: {source.name} has its own rig"]
     if has_topology_of(animated.neutral, model):
@@ -71,11 +71,12 @@ def read_coarse(path: Path, model: Mesh, settings: InputSettings, state: Path, p
     return replace(coarse, notes=(*notes, *coarse.notes))
 
 
-def _even(animated: AnimatedMesh, fps: float | None) -> tuple[AnimatedMesh, list[str]]:
-    """The animation at an even rate, which the model's timing and the results have, and what is to be said of it."""
+def at_even_rate(animated: AnimatedMesh, fps: float | None) -> tuple[AnimatedMesh, list[str]]:
+    """The animation at an even rate, which the model's timing and the results have, and what is to be said of it and
+    of frames that are missing."""
     take = animated.take
     if take is None or take.seconds is None or animated.rig is None:
-        return animated, []
+        return animated, [f"warning: {animated.path.name}: {animated.missing}"] if animated.missing else []
     even = take.resampled(fps)
     return moved_mesh(animated.path, animated.rig, even), [resampling_note(animated.path, take, even)]
 
