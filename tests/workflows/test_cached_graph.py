@@ -1,6 +1,8 @@
 """A graph is exported once, and anew where what was kept is damaged or what it is made of has changed."""
 
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from time import sleep
 
 import pytest
 from onnx import ModelProto, TensorProto, helper
@@ -45,6 +47,21 @@ def test_it_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     graph("landmarks/images/trees")  # other code
     graph(kind="other")
     assert make.count == 7
+
+
+def test_of_two_that_ask_at_once_one_makes_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TORCHFACE_CACHE", str(tmp_path))
+    make = Maker()
+
+    def slowly() -> ModelProto:
+        made = make()
+        sleep(0.3)
+        return made
+
+    with ThreadPoolExecutor() as runs:
+        first, second = runs.map(lambda _: cached_graph("eyes", slowly, ()), range(2))
+    assert first == second
+    assert make.count == 1
 
 
 def test_a_cache_that_cannot_be_written_to_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

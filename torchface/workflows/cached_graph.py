@@ -3,11 +3,12 @@ changed."""
 
 import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import torch
+from filelock import FileLock
 
 import torchface
 from torchface.errors import FileFormatError
@@ -27,17 +28,25 @@ def cached_graph(kind: str, make: "Callable[[], onnx.ModelProto]", code: Sequenc
 def cached_file(kind: str, ending: str, make: Callable[[], bytes], code: Sequence[str], **models: object) -> bytes:
     """What ``make`` makes of models: from the cache where it is there and whole; kept if the cache can be written to.
 
+    Of processes that ask for it at once one makes it, and the others wait.
+
     ``code`` are folders of this package that say what becomes of the models, ``models`` as of ``content_key``.
     """
     name = _name(kind, ending, code, models)
     content = _kept(kind, name)
-    if content is None:
-        content = make()
-        with suppress(FileFormatError), all_or_none():
-            path = cache_folder(kind) / name
-            write_file(path, content)
-            write_file(path.with_suffix(".sha256"), hashlib.sha256(content).hexdigest().encode())
-    return content
+    if content is not None:
+        return content
+    with ExitStack() as held:
+        with suppress(FileFormatError, OSError):  # a cache that cannot be written to, a file system without locks
+            held.enter_context(FileLock(cache_folder(kind) / f"{name}.lock", mode=0o666))
+        content = _kept(kind, name)
+        if content is None:
+            content = make()
+            with suppress(FileFormatError), all_or_none():
+                path = cache_folder(kind) / name
+                write_file(path, content)
+                write_file(path.with_suffix(".sha256"), hashlib.sha256(content).hexdigest().encode())
+        return content
 
 
 def kept_file(kind: str, ending: str, code: Sequence[str], **models: object) -> bytes | None:
