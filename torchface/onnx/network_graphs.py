@@ -2,17 +2,20 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import onnx
 import torch
+from onnx import helper, numpy_helper
 from torch import Tensor, nn
 
 from torchface.landmarks import BoxNetwork, EyeFindings, EyeNetwork, LandmarkNetwork, NetworkLandmarks
+from torchface.landmarks.images.boxes.box_network import COPIES, enlarged
 from torchface.landmarks.images.folded_normalisation import without_normalisation
 from torchface.landmarks.images.networks.part_network import PART_MARGIN, PART_SIZE, PARTS, PartNetwork
 from torchface.onnx.checked_export import ExportReport, write_checked
-from torchface.onnx.exported_model import exported_model, half_stored
+from torchface.onnx.exported_model import check_model, exported_model, half_stored, rename_values
 
 ImageNetwork = LandmarkNetwork | EyeNetwork | PartNetwork | BoxNetwork
 
@@ -98,15 +101,65 @@ def network_model(network: ImageNetwork, facts: Mapping[str, object] | None = No
     }  # fmt: skip
     task = names[type(network)]
     fused = without_normalisation(network)
+    metadata = {"task": task, **form.metadata, **(facts or {})}
+    if isinstance(fused, BoxNetwork):
+        return _box_model(fused, form, metadata)
     module = _Given(fused, _given(fused)) if isinstance(fused, LandmarkNetwork) else fused
     model = exported_model(
         module,
         {form.images: form.example},
         list(form.parity),
-        {"task": task, **form.metadata, **(facts or {})},
+        metadata,
         {form.images: form.sizes},
     )
-    return model if isinstance(network, BoxNetwork) else half_stored(model, halves(module))
+    return half_stored(model, halves(module))
+
+
+def _box_model(network: BoxNetwork, form: _Form, metadata: Mapping[str, object]) -> onnx.ModelProto:
+    """What says the cells of one copy is exported once: exported with each copy's sizes the whole takes a minute."""
+    images, cells = {form.images: form.example}, {"cells": network.cells(form.example).detach()}
+    part = exported_model(_Method(network, "cells"), images, list(cells), {}, {form.images: form.sizes}).graph
+    count = {"cells": ("batch", "count")}
+    model = exported_model(_Method(network, "likeliest"), cells, list(form.parity), metadata, count)
+    rename_values(model.graph, lambda name: name if name in form.parity else f"all.{name}")
+    kept, said, shown = {one.name: one.name for one in part.initializer}, list[str](), form.images
+    nodes = list[onnx.NodeProto]()
+    for half in range(COPIES):
+        if half:
+            nodes += [helper.make_node("AveragePool", [shown], [f"{half}.copy"], kernel_shape=[2, 2], strides=[2, 2])]
+            shown = f"{half}.copy"
+        copy, named = onnx.GraphProto(), {**kept, form.images: shown}
+        copy.CopyFrom(part)
+        rename_values(copy, partial(_renamed, named, f"{half}."))
+        scale, offset, scaled, faces = (f"{half}.{name}" for name in ("scale", "offset", "scaled", "faces"))
+        moved = enlarged(torch.zeros(6), 2**half)
+        for name, value in {scale: enlarged(torch.ones(6), 2**half) - moved, offset: moved}.items():
+            part.initializer.append(numpy_helper.from_array(value.numpy(), name))
+        nodes += [*copy.node, helper.make_node("Mul", [f"{half}.cells", scale], [scaled])]
+        nodes += [helper.make_node("Add", [scaled, offset], [faces])]
+        said.append(faces)
+    nodes += [helper.make_node("Concat", said, ["all.cells"], axis=1), *model.graph.node]
+    del model.graph.node[:], model.graph.input[:]
+    model.graph.node.extend(nodes)
+    model.graph.input.extend(part.input)
+    model.graph.initializer.extend(part.initializer)
+    check_model(model)
+    return model
+
+
+def _renamed(known: Mapping[str, str], prefix: str, name: str) -> str:
+    return known.get(name, prefix + name)
+
+
+class _Method(nn.Module):
+    """A method of a network as a module."""
+
+    def __init__(self, network: nn.Module, name: str) -> None:
+        super().__init__()
+        self.network, self.name = network, name
+
+    def forward(self, given: Tensor) -> Tensor:
+        return getattr(self.network, self.name)(given)  # type: ignore[no-any-return]
 
 
 def _given(network: LandmarkNetwork) -> tuple[str, ...]:

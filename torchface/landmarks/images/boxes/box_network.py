@@ -171,7 +171,10 @@ class BoxNetwork(nn.Module):
         copies = [as_real(images)]
         for _ in range(COPIES - 1):
             copies.append(avg_pool2d(copies[-1], 2))
-        cells = torch.cat([_enlarged(self.cells(copy), 2**half) for half, copy in enumerate(copies)], 1)
+        return self.likeliest(torch.cat([enlarged(self.cells(copy), 2**half) for half, copy in enumerate(copies)], 1))
+
+    def likeliest(self, cells: Tensor) -> Tensor:
+        """The likeliest of the faces (B,N,6) of all cells, as :meth:`forward` gives them."""
         rows = cells[..., 3].topk(self.faces, dim=1).indices
         faces = cells.gather(1, rows[..., None].expand(-1, -1, 6))
         apart = (faces[:, :, None, :2] - faces[:, None, :, :2]).square().sum(-1).sqrt()
@@ -183,7 +186,7 @@ class BoxNetwork(nn.Module):
         return torch.cat([faces[..., :3], scores[..., None], faces[..., 4:]], -1)
 
 
-def _enlarged(faces: Tensor, scale: int) -> Tensor:
+def enlarged(faces: Tensor, scale: int) -> Tensor:
     """Faces (...,6) in pixels of a picture that is larger by a scale."""
     return faces * faces.new_tensor([scale] * 3 + [1] * 3) + faces.new_tensor([(scale - 1) / 2] * 2 + [0] * 4)
 
