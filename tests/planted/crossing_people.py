@@ -1,10 +1,12 @@
 """Two people before one camera, of whom the second passes in front of the first: rendered embedded performers."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import torch
 from torch import Tensor
 
+from torchface import BlendshapeRig
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import IDENTITY, performer
@@ -38,9 +40,8 @@ def crossing_film(
         stays: seconds for which the second stands right before the first.
         fps: frames a second.
     """
-    first, column = _head(torch.zeros(len(IDENTITY)), (1.0, 1.0, 1.0), 1.0)
-    person = torch.linspace(-1.5, 1.5, len(IDENTITY))
-    second, _ = _head(person[torch.randperm(len(IDENTITY), generator=torch.Generator().manual_seed(1))], tint, larger)
+    first, column = _head(True, (1.0, 1.0, 1.0), 1.0)
+    second, _ = _head(False, tint, larger)
     left = 120
     head = 100 * (1 + larger) / 2  # pixels: while it is nearer than that to the first, it covers it
     step = 2 * head / (hidden * fps)
@@ -61,9 +62,18 @@ def crossing_film(
     return CrossingFilm(torch.stack(frames), torch.full((len(frames),), left + column))
 
 
-def _head(identity: Tensor, tint: tuple[float, ...], scale: float) -> tuple[tuple[Tensor, Tensor], float]:
+@cache
+def _person(first: bool) -> BlendshapeRig:
+    if first:
+        return performer(torch.zeros(len(IDENTITY)))
+    person = torch.linspace(-1.5, 1.5, len(IDENTITY))
+    return performer(person[torch.randperm(len(IDENTITY), generator=torch.Generator().manual_seed(1))])
+
+
+@cache
+def _head(first: bool, tint: tuple[float, ...], scale: float) -> tuple[tuple[Tensor, Tensor], float]:
     """A head's picture uint8 (3,S,S) and the pixels that show it; the middle of its landmarks, column."""
-    rig, side = performer(identity), round(_SIDE * scale)
+    rig, side = _person(first), round(_SIDE * scale)
     marks = rig.neutral.landmarks
     camera = look_at(rig.vertices[marks].double().mean(0), 0.0, 0.0, 330.0, side, side)
     light = Lighting(occlusion_rays=0)

@@ -1,10 +1,12 @@
 """One face in a camera's pictures: it is kept, lost and found; its eyes are read as the library reads them."""
 
+from collections.abc import Callable
+from copy import copy
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn.functional import interpolate
 
 from planted.crossing_people import crossing_film
@@ -33,6 +35,7 @@ from torchface.landmarks.images.person_identity import (
 )
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import performer
+from torchface.workflows.named_finders import graph_detector
 
 
 @pytest.fixture(scope="module")
@@ -50,6 +53,33 @@ def reader() -> FaceReader:
     """With the zoo's networks."""
     networks = WebcamNetworks(*(zoo.get_model(name) for name in ("face_boxes", "landmark_network", "eye_network")))
     return FaceReader(networks).eval()
+
+
+class Run(nn.Module):
+    """A network's graph as a module of crops."""
+
+    def __init__(self, run: Callable[[Tensor], Any], size: int = 0, margin: float = 0.0) -> None:
+        super().__init__()
+        self.run, self.size, self.margin = run, size, margin
+
+    def forward(self, images: Tensor) -> Any:
+        return self.run(images)
+
+
+@pytest.fixture(scope="module")
+def quick(reader: FaceReader) -> FaceReader:
+    """For films: its networks run in ONNX Runtime, as those of programs do; PyTorch takes far longer."""
+    found, detector = copy(reader), graph_detector()
+    found._modules = {**reader._modules}
+    found.boxes = Run(detector.detector.network)
+    found.landmarks = Run(detector.network, detector.size, detector.margin)
+    return found
+
+
+def quick_tracker(fps: float = 30.0) -> LandmarkTracker:
+    """See ``quick``."""
+    detector = graph_detector()
+    return LandmarkTracker(CropFinder(detector.network, detector.size, detector.margin), detector=detector, fps=fps)
 
 
 class Webcam:
@@ -230,13 +260,10 @@ def test_a_plain_wall_is_no_face_for_long(
     ],
     ids=["beside", "passing", "alike", "slow", "near", "before", "alike before"],
 )
-def test_it_stays_with_a_person_before_whom_another_passes(reader: FaceReader, film: dict[str, Any]) -> None:
+def test_it_stays_with_a_person_before_whom_another_passes(quick: FaceReader, film: dict[str, Any]) -> None:
     """Reader and tracker alike: never for two frames with the other, soon with the first again; others are counted."""
-    crossing = crossing_film(**film)
-    network = zoo.get_model("landmark_network")
-    fps = film.get("fps", 30)
-    tracker = LandmarkTracker(CropFinder(network, network.size, network.margin), detector=shipped_detector(), fps=fps)
-    webcam, away = Webcam(reader), torch.zeros(2, len(crossing.frames))
+    crossing, fps = crossing_film(**film), film.get("fps", 30)
+    tracker, webcam, away = quick_tracker(fps), Webcam(quick), torch.zeros(2, len(crossing.frames))
     for i, frame in enumerate(crossing.frames):
         for row, found in enumerate((webcam.step(frame, 1 / fps), tracker.step(frame))):
             away[row, i] = abs(float(found.landmarks[:, 0].mean()) - float(crossing.columns[i]))
@@ -250,23 +277,23 @@ def test_it_stays_with_a_person_before_whom_another_passes(reader: FaceReader, f
 
 def test_one_of_two_boxes_that_overlap_is_not_mistaken_for_good() -> None:
     """Who comes out from behind another little by little is followed again."""
-    crossing = crossing_film(hidden=3.0)
-    network = zoo.get_model("landmark_network")
-    tracker = LandmarkTracker(CropFinder(network, network.size, network.margin), detector=shipped_detector())
+    crossing, tracker = crossing_film(hidden=3.0), quick_tracker()
     away = torch.tensor([column(tracker.step(frame)) for frame in crossing.frames]) - crossing.columns
     assert away[60:80].isnan().all()
     assert (away.abs().nan_to_num(0.0) < 16).all()
     assert (away[-20:].abs() < 2).all()
 
 
-def test_who_stays_before_another_is_followed_in_the_end(webcam: Webcam) -> None:
+def test_who_stays_before_another_is_followed_in_the_end(quick: FaceReader) -> None:
+    webcam = Webcam(quick)
     frames = crossing_film(stays=10.0, after=0, fps=10).frames
     seen = [column(webcam.step(frame, 0.1)) for frame in frames]
     assert all(one != one for one in seen[27:74])  # for five seconds
     assert seen[-7] == seen[-7]
 
 
-def test_a_person_who_passes_before_another_is_kept(webcam: Webcam) -> None:
+def test_a_person_who_passes_before_another_is_kept(quick: FaceReader) -> None:
+    webcam = Webcam(quick)
     frames = crossing_film(larger=1.3).frames[5:]  # the nearer is the larger, and so the one that is followed
     columns = [column(webcam.step(frame)) for frame in frames]
     assert min(columns) == pytest.approx(columns[-1], abs=2)
