@@ -10,7 +10,13 @@ from torchface import BlendshapeRig, TorchfaceError
 from torchface.errors import AlignmentError, FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.shape_names import mirror
 from torchface.synthetic import performer
-from torchface.workflows.rig.expression_scans import check_side, expressions_in, neutral_in, seen_example
+from torchface.workflows.rig.expression_scans import (
+    check_expression,
+    check_side,
+    expressions_in,
+    neutral_in,
+    seen_example,
+)
 
 NAMES = ("jawOpen", "browInnerUp_L", "browInnerUp_R", "mouthSmile_L")
 
@@ -112,6 +118,18 @@ def test_the_other_side_is_told_with_both_distances(actor: BlendshapeRig, given:
 def test_a_symmetric_expression_tells_nothing(actor: BlendshapeRig, given: dict[str, float]) -> None:
     seen = torch.ones(len(actor.vertices), dtype=torch.bool)
     check_side(actor, weights(actor, **given), shown(actor, weights(actor, mouthSmileRight=1.0)), seen)
+
+
+def test_another_expression_or_a_face_at_rest_by_its_name_is_told(actor: BlendshapeRig) -> None:
+    seen = torch.ones(len(actor.vertices), dtype=torch.bool)
+    jaw, brow = weights(actor, jawOpen=0.9), weights(actor, browInnerUp=0.9)
+    for strength in (0.6, 1.4):  # another person's strength
+        check_expression(actor, jaw, shown(actor, jaw * strength), seen)
+    check_expression(actor, brow, shown(actor, brow), seen)
+    said = r"something else: \S+ mm \(root mean square, across the skin\) .*, \S+ mm from the face at rest"
+    for asked, found in ((brow, jaw), (jaw, brow), (jaw, jaw * 0)):
+        with pytest.raises(AlignmentError, match=said):
+            check_expression(actor, asked, shown(actor, found), seen)
 
 
 def test_seen_vertices_keep_their_offset_and_unseen_ones_return_to_what_was_expected(dome_rig: BlendshapeRig) -> None:

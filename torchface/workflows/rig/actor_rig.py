@@ -61,6 +61,7 @@ from torchface.workflows.rig.actor_report import ActorReport
 from torchface.workflows.rig.expression_scans import (
     LAYOUT,
     Expression,
+    check_expression,
     check_side,
     expressions_in,
     neutral_in,
@@ -270,7 +271,8 @@ class _Actor:
                 moved = (guess.vertices - neutral.vertices).norm(dim=-1)
                 steady = registered.matched / (1 + (moved / _FOLLOWS) ** 2)
                 aligned = in_place_of(registered.mesh, guess, steady.double())
-                check_side(actor, expression.weights, aligned.vertices, registered.matched & matched)
+                for check in (check_side, check_expression):
+                    check(actor, expression.weights, aligned.vertices, registered.matched & matched)
             except TorchfaceError as error:
                 self.skipped.append(f"example {expression.path.name}: {error}")
                 continue

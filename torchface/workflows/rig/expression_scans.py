@@ -31,6 +31,9 @@ _LEAST_VERTICES = 20
 # Of the way from the middle between the two: 1 is what was asked for, -1 its mirror image; a weak expression is near 0.
 # Mirrored scans of another performer's smile, brow and jaw come to -0.5 to -0.8, right ones to 0.9 and more.
 _CLEARLY_OTHER = -0.35
+# Of its distance from the face at rest, what an example is off what it is named for. Right examples of another
+# performer, up to 1.4 times as strong, come to at most 0.3; a jaw named brow, another head, a face at rest to 1.
+_UNSHOWN = 0.97
 _DATA_WEIGHT = 10.0
 _DAMPING = 0.03
 
@@ -159,6 +162,21 @@ def check_side(actor: BlendshapeRig, weights: Tensor, found: Tensor, seen: Tenso
             f"shows the other side: {distances[0]:.2g} mm (root mean square, across the skin) from what it is named "
             f"for, {distances[1]:.2g} mm from the mirror image of that (side {side:.2f} of 1 to -1); the scans are "
             "mirrored (export them in right-handed axes), or left and right are swapped in their names"
+        )
+
+
+def check_expression(actor: BlendshapeRig, weights: Tensor, found: Tensor, seen: Tensor) -> None:
+    """Refuses a registered expression that is as far from what it is named for as from the face at rest, along the
+    skin's normals: it shows another expression or head, or none."""
+    rest, asked = actor(torch.stack([torch.zeros_like(weights), weights]).to(actor.deltas)).double()
+    normals = vertex_normals(asked, actor.neutral.faces)
+    off = [((found.to(asked) - x) * normals).sum(-1)[seen.to(asked.device)] for x in (asked, rest)]
+    named, still = (float(x.square().mean().sqrt()) if len(x) else 0.0 for x in off)
+    if named > max(_TELLING, _UNSHOWN * still):
+        raise AlignmentError(
+            f"shows something else: {named:.2g} mm (root mean square, across the skin) from what it is named for, "
+            f"{still:.2g} mm from the face at rest, expected clearly less than that; the name is another expression's, "
+            "or the scan shows another person or a face at rest"
         )
 
 
