@@ -5,6 +5,7 @@ A strategy gives the files by name, the one to read first. Readers are tested al
     check_built(load_mesh, "built_meshes", "obj_files")
 """
 
+import gc
 import importlib
 import json
 import math
@@ -17,6 +18,7 @@ from typing import Any
 import torch
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from hypothesis.internal.conjecture import providers
 from reader_budget import MEGABYTES, SECONDS, find_reader, limit_memory, place_of, run_child
 
 Files = dict[str, bytes]
@@ -53,6 +55,9 @@ def _run(job: dict[str, Any], folder: Path) -> dict[str, int]:
     from torchface.errors import TorchfaceError
 
     reader, outcome, limited = find_reader(job), {"read": 0, "refused": 0}, [False]
+    gc.freeze()  # Hypothesis collects garbage at its start: among all that is imported, that takes a third of a second
+    if hasattr(providers, "_get_local_constants") and hasattr(providers, "_local_constants"):  # see tests/conftest.py
+        providers._get_local_constants = lambda: providers._local_constants
 
     @settings(
         max_examples=job["cases"],
