@@ -162,6 +162,16 @@ def test_frames_may_be_picked(folder: Path, rig: BlendshapeRig, weights: torch.T
             evaluate(folder / "true.csv", folder / "some.csv", folder / "out", replace(settings, frames=wrong))
 
 
+def test_meshes_that_lack_frames_are_said_to_be_compared_by_their_place(folder: Path) -> None:
+    (folder / "meshes" / "f5.ply").rename(folder / "meshes" / "f7.ply")
+    settings = EvaluationSettings(rig=folder / "rig.glb")
+    for one, other in (("meshes", "true.safetensors"), ("true.safetensors", "meshes")):
+        (note,) = evaluate(folder / one, folder / other, folder / "out", settings).notes
+        lost = "meshes: 2 of 8 frames are missing, first from f4.ply to f7.ply"
+        assert note == f"warning: {lost}; the first frame was compared with the first, and so on"
+    assert evaluate(folder / "meshes", folder / "meshes", folder / "out", settings).notes == ()
+
+
 def test_what_does_not_fit_is_told(folder: Path, rig: BlendshapeRig, weights: torch.Tensor) -> None:
     true, out = folder / "true.glb", folder / "out"
     with pytest.raises(NameMismatchError, match="weights without a rig"):

@@ -168,8 +168,11 @@ def _pairs(found: AnimatedMesh, true: AnimatedMesh, settings: EvaluationSettings
 def _by_number(
     found: AnimatedMesh, true: AnimatedMesh, chosen: tuple[int, ...] | None
 ) -> tuple[Tensor, Tensor, list[str]]:
-    frames = _frames(found, true, chosen)
-    return frames, torch.arange(len(frames), dtype=torch.float64), _rate_notes(found, true)
+    frames, notes = _frames(found, true, chosen), _rate_notes(found, true)
+    if chosen is None and found.missing != true.missing:
+        lost = ", ".join(f"{one.path.name}: {one.missing}" for one in (found, true) if one.missing)
+        notes = [*notes, f"warning: {lost}; the first frame was compared with the first, and so on"]
+    return frames, torch.arange(len(frames), dtype=torch.float64), notes
 
 
 def _times(animated: AnimatedMesh, numbered: bool) -> Tensor:
