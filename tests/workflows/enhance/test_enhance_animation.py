@@ -348,6 +348,10 @@ def test_what_does_not_fit_the_model_is_named(actor: Actor, tmp_path: Path) -> N
     large = written(tmp_path / "large.safetensors", 10 * actor.frames, faces)
     with pytest.raises(AlignmentError, match=r"10\.\d times too large"):
         coarse(actor, large, tmp_path)
+    empty = actor.frames.clone()
+    empty[5] = 0
+    with pytest.raises(ValueRangeError, match=r"empty\.safetensors: found all vertices of frame 5 in one place"):
+        coarse(actor, written(tmp_path / "empty.safetensors", empty, faces), tmp_path)
     broken = actor.frames.clone()
     broken[5, 3] = torch.nan
     with pytest.raises(ValueRangeError, match="NaN or infinity in frame 5"):

@@ -97,13 +97,20 @@ def resampling_note(path: Path, take: Take, even: Take) -> str:
 
 
 def check_finite(vertices: Tensor, path: Path, step: int, begin: int = 0) -> None:
-    """Raises ``ValueRangeError`` for vertices (t,N,3) that hold NaN or infinity, every ``step``-th frame from one."""
+    """Raises ``ValueRangeError`` for vertices (t,N,3) that hold NaN or infinity, or all lie in one place; every
+    ``step``-th frame from one."""
     wrong = ~torch.isfinite(vertices).all(-1)
     if wrong.any():
         frame = int(wrong.any(-1).nonzero()[0, 0])
         raise ValueRangeError(
             f"{path}: found NaN or infinity in frame {begin + frame * step} ({int(wrong[frame].sum())} of "
             f"{wrong.shape[1]} vertices), expected numbers; leave such frames out, or repair them first"
+        )
+    empty = (vertices == vertices[:, :1]).flatten(1).all(1).nonzero()[:, 0]
+    if len(empty):
+        raise ValueRangeError(
+            f"{path}: found all vertices of frame {begin + int(empty[0]) * step} in one place, expected a head; leave "
+            "such frames out, or repair them first"
         )
 
 
