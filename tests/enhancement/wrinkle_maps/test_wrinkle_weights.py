@@ -1,5 +1,7 @@
 """The weights of wrinkle maps by a rig's pose."""
 
+import copy
+
 import pytest
 import torch
 from torch import Tensor
@@ -68,6 +70,16 @@ def test_a_head_that_turns_keeps_its_weights_and_the_neutral_has_none(
     turned = vertices @ rotation_matrix(torch.tensor([0.4, -1.9, 0.7])).T + torch.tensor([300.0, -50.0, 900.0])
     torch.testing.assert_close(learned(turned), learned(vertices), atol=2e-3, rtol=0)
     assert float(learned(rig.vertices[None]).abs().max()) == 0
+
+
+def test_large_coefficients_that_cancel_cost_no_digits(rig: BlendshapeRig, poses: Tensor, shares: Tensor) -> None:
+    either = (torch.rand(60, len(shares), 2, generator=seeded(3)) > 0.5).float()  # no map of few components fits it
+    names = [f"region {i}" for i in range(len(shares))]
+    learned = WrinkleWeights.fit(rig.vertices, rig(poses), either, shares, names)
+    learned.coefficients *= 50  # as of 300 poses of a face
+    moments = learned.moments((rig(poses) - rig.vertices)[:, learned.sites])
+    exact = copy.deepcopy(learned).double().of_moments(moments.double())
+    torch.testing.assert_close(learned.of_moments(moments).double(), exact, atol=5e-6, rtol=0)
 
 
 def test_blendshape_weights_give_what_the_vertices_give(

@@ -176,9 +176,13 @@ class WrinkleWeights(nn.Module):
 
     def _value(self, scores: Tensor) -> Tensor:
         """What regression says of scores (R,T,q), (R,T,M)."""
-        own, other = scores.square().sum(-1, keepdim=True), self.centers.square().sum(-1)[:, None]
-        apart = (own + other - 2 * scores @ self.centers.transpose(1, 2)).clamp(min=0)
-        return scores @ self.linear + (-apart * self.sharpness).exp() @ self.coefficients + self.bias
+        # In double precision: coefficients of 50 and more cancel to weights of at most 1.
+        given, scores, centers = scores, scores.double(), self.centers.double()
+        own, other = scores.square().sum(-1, keepdim=True), centers.square().sum(-1)[:, None]
+        apart = (own + other - 2 * scores @ centers.transpose(1, 2)).clamp(min=0)
+        near = (-apart * self.sharpness.double()).exp()
+        value = scores @ self.linear.double() + near @ self.coefficients.double() + self.bias.double()
+        return value.to(given)
 
     def _set_rows(self, neutral: Tensor, poses: Tensor, shares: Tensor) -> None:
         """The sums to be taken: the best linear map from the neutral, then principal components in the regions."""
