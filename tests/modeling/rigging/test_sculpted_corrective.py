@@ -92,6 +92,14 @@ def test_a_mesh_of_another_pose_is_warned_of(rig: BlendshapeRig) -> None:
     assert any("jawOpen-0.5" in line and "another pose" in line for line in made.lines())
 
 
+def test_a_mesh_of_the_other_side_is_warned_of() -> None:
+    rig = performer(texture=False).select(("jawOpen", "mouthSmileLeft", "mouthSmileRight"))
+    left, right = torch.tensor([0.7, 1.0, 0.0]), torch.tensor([0.7, 0.0, 1.0])
+    warning = next(x for x in corrective_from_sculpt(rig, left, bump(rig, right)).lines() if "another pose" in x)
+    assert "mouthSmileLeft-1.00 mouthSmileRight+1.00" in warning
+    assert not any("another pose" in x for x in corrective_from_sculpt(rig, left, bump(rig, left)).lines())
+
+
 @pytest.mark.parametrize(
     ("weights", "message"),
     [

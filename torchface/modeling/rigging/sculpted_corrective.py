@@ -12,6 +12,7 @@ from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.number_checks import as_tensor, checked_type
 from torchface.rig import BlendshapeRig
+from torchface.shape_names import mirror
 
 # Millimetres: less is what files round; a shift of less moves nothing that is seen.
 _CHANGED, _SHIFTED = 1e-3, 0.05
@@ -20,7 +21,7 @@ _EXPLAINED = 0.1
 _SAME_PEAK = 1e-4
 # Of the mesh's extent, the median distance at which it is no sculpt of this rig; heads differ by less.
 _FAR = 0.03
-# Of the change's square, what a change of the drivers' weights explains where the pose was another one.
+# Of the square of the change, what other weights of the drivers and their mirror images explain at another pose.
 _ANOTHER_POSE = 0.7
 _ITERATIONS = 30
 
@@ -58,11 +59,13 @@ class SculptedCorrective:
                 f"the corrective is {self.activation:.3g} on at this pose; where it is fully on it moves vertices by "
                 f"up to {float(far.max()) / self.activation:.3g} mm"
             )
-        deltas = self.rig.deltas[self.rig.index(self.definition.drivers)].flatten(1).cpu().double()
+        drivers = torch.as_tensor(self.rig.index(self.definition.drivers))
+        both = torch.cat([drivers, mirror(self.rig.names)[drivers]]).unique()  # a sculpt of the other side is known too
+        deltas = self.rig.deltas[both].flatten(1).cpu().double()
         steps = torch.linalg.lstsq(deltas.T, self.change.flatten()[:, None], driver="gelsd").solution[:, 0]
         if float((steps @ deltas).square().sum()) > _ANOTHER_POSE * float(self.change.square().sum()):
             other = " ".join(
-                f"{name}{step:+.2f}" for name, step in zip(self.definition.drivers, steps.tolist(), strict=True)
+                f"{self.rig.names[shape]}{step:+.2f}" for shape, step in zip(both.tolist(), steps.tolist(), strict=True)
             )
             lines.append(f"warning: {other} is most of the change; was the mesh sculpted at another pose?")
         if self.within:
