@@ -1,5 +1,7 @@
 """Correctives from sculpts: exact at the pose, nothing where a driver is off, refused where they do not fit."""
 
+import re
+
 import pytest
 import torch
 from torch import Tensor
@@ -96,7 +98,7 @@ def test_a_mesh_of_the_other_side_is_warned_of() -> None:
     rig = performer(texture=False).select(("jawOpen", "mouthSmileLeft", "mouthSmileRight"))
     left, right = torch.tensor([0.7, 1.0, 0.0]), torch.tensor([0.7, 0.0, 1.0])
     warning = next(x for x in corrective_from_sculpt(rig, left, bump(rig, right)).lines() if "another pose" in x)
-    assert "mouthSmileLeft-1.00 mouthSmileRight+1.00" in warning
+    assert re.search(r"mouthSmileLeft-(1.0|0.9)\d mouthSmileRight\+(1.0|0.9)\d", warning)
     assert not any("another pose" in x for x in corrective_from_sculpt(rig, left, bump(rig, left)).lines())
 
 
