@@ -69,6 +69,7 @@ class FitSettings:
         texture_size: of the skin, texels a side; 0 makes no texture.
         irises: centres of the irises in each photograph, (I,2,2) pixels, NaN where unknown: their colour is there.
         parts: what each photograph shows: skin and features alone are projected onto the head; all if absent.
+        match_skin: move the head until several photographs show the same skin at the same place; see ``agreed_skin``.
         paint_hair: paint the hair that photographs show on the head; else its colour is found alone.
 
     Raises:
@@ -104,6 +105,7 @@ class FitSettings:
     irises: Tensor | None = None
     parts: Sequence[FaceParts] | None = None
     paint_hair: bool = True
+    match_skin: bool = True
 
     def __post_init__(self) -> None:
         for name in ("inner_weight", "expression_mean", "expression_ridge", "asymmetry", "identity_bound"):

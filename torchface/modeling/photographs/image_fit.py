@@ -13,6 +13,7 @@ from torchface.geometry.cameras.sliding_contour import LevelCurves, level_curves
 from torchface.geometry.similarity import similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.head_model import HeadModel
+from torchface.modeling.photographs.face_piece import FacePiece
 from torchface.modeling.photographs.feature_alignment import FeatureAlignment
 from torchface.modeling.photographs.fit_problem import Problem, State
 from torchface.modeling.photographs.fit_settings import FitSettings
@@ -26,6 +27,7 @@ from torchface.modeling.photographs.image_input import (
 from torchface.modeling.photographs.image_solve import covariance, solve, solve_either
 from torchface.modeling.photographs.image_texture import photographed_skin
 from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS, LandmarkSites, LinearPoints, Views
+from torchface.modeling.photographs.multiple_views import HeldMarks, ShownHead, SkinAgreement, agreed_skin
 from torchface.modeling.photographs.texture_fit import ColorFit
 from torchface.modeling.rigging.deformation_transfer import transfer_with_report
 from torchface.part_materials import EYEBALL, part_material
@@ -35,6 +37,7 @@ from torchface.shape_names import mirror
 
 _MAX_ANGLE = 100.0  # degrees from the camera; a face rotated further shows none of its inner landmarks
 _MAX_MISFIT = 0.25  # of the face's size; the mean face fits landmarks of strong expressions better than this
+_HELD = 2.0  # deviations of a landmark beside hundreds of matches: neighbours err alike
 _SHOWS = 0.5  # millimetres at a landmark by which a shape has to show for its personal form to matter
 
 
@@ -57,6 +60,8 @@ class ImageFit:
         hair: its colour, (3,); None where photographs show a bald head.
         iris: the irises' colour, (3,); None where no photograph shows it.
         fringe: whether hair hangs over the forehead.
+        agreement: what the skin that several photographs show moved the head by; None with one photograph, without
+            images, or where they do not agree.
     """
 
     mesh: Mesh
@@ -72,6 +77,7 @@ class ImageFit:
     hair: Tensor | None = None
     iris: Tensor | None = None
     fringe: bool = False
+    agreement: SkinAgreement | None = None
 
     @property
     def errors(self) -> Tensor:
@@ -171,7 +177,17 @@ def fit_images(
         points = LinearPoints.of(mean, torch.cat([modes, deltas]), sites)
         problem = replace(problem, points=points)
         state = solve(problem, state)
-    fit = _standing_as(rig.neutral, vertices, _result(problem, state, rig.neutral, mean, modes, deltas, sizes))
+    head = _Head(mean, modes, deltas)
+    fit = _result(problem, state, rig.neutral, head, sizes)
+    if images is not None and len(images) > 1 and settings.match_skin:
+        progress("matching the skin between the photographs")
+        agreement = _agreement(fit, images, modes[: len(modes) - len(unknown)], vertices[JAW:], settings)
+        if agreement is not None:
+            head = replace(head, mean=mean + agreement.moved.float())
+            points = LinearPoints.of(head.mean, torch.cat([modes, deltas]), sites)
+            problem, state = replace(problem, points=points), replace(state, views=Views.of(agreement.cameras))
+            fit = replace(_result(problem, state, rig.neutral, head, sizes), agreement=agreement)
+    fit = _standing_as(rig.neutral, vertices, fit)
     if images is None:
         return fit
     progress("projecting the photographs onto the head")
@@ -199,9 +215,28 @@ def with_skin(fit: ImageFit, model: HeadModel, images: Sequence[Tensor], setting
     )
 
 
-def _result(
-    problem: Problem, state: State, template: Mesh, mean: Tensor, modes: Tensor, deltas: Tensor, sizes: Tensor
-) -> ImageFit:
+@dataclass(frozen=True, eq=False)
+class _Head:
+    """A head by coefficients of identity and weights."""
+
+    mean: Tensor  # (V,3)
+    modes: Tensor  # (K,V,3)
+    deltas: Tensor  # (N,V,3)
+
+
+def _agreement(
+    fit: ImageFit, images: Sequence[Tensor], modes: Tensor, inner: Tensor, settings: FitSettings
+) -> SkinAgreement | None:
+    """What the skin in several photographs says of a fit; inner landmarks keep their places."""
+    pieces = [FacePiece.around(image.cpu(), marks) for image, marks in zip(images, fit.landmarks, strict=True)]
+    places = [one.project(mesh.vertices[inner].double()) for mesh, one in zip(fit.posed, fit.cameras, strict=True)]
+    marks = HeldMarks(inner, torch.stack(places) - fit.residuals[:, JAW:], _HELD * fit.noise)
+    head = ShownHead(fit.posed, fit.cameras, modes, settings.focal_deviation, settings.shared_focal)
+    return agreed_skin(head, pieces, marks, settings.parts)
+
+
+def _result(problem: Problem, state: State, template: Mesh, head: _Head, sizes: Tensor) -> ImageFit:
+    mean, modes, deltas = head.mean, head.modes, head.deltas
     whole, known = state.coefficients[: len(modes)].float(), len(modes) - problem.smooth
     weights = problem.weights(state.coefficients).float().expand(len(problem.found), -1)
     rest = mean + torch.tensordot(whole, modes, dims=1)

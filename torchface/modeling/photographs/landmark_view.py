@@ -1,11 +1,13 @@
 """Landmarks in photographs of a linear face: where its points are seen, and their derivatives."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
 
 from torchface.attachment import Attachment
+from torchface.geometry.cameras.pinhole import Camera
 from torchface.geometry.cameras.pnp import pixel_jacobian
 from torchface.geometry.cameras.sliding_contour import LevelCurves, outermost
 from torchface.geometry.rotations import cross_matrix, rotation_matrix
@@ -91,6 +93,14 @@ class Views:
     intrinsics: Tensor
     rotation: Tensor
     translation: Tensor
+
+    @staticmethod
+    def of(cameras: Sequence[Camera]) -> "Views":
+        """Those of cameras."""
+        intrinsics, rotation, translation = zip(
+            *((c.intrinsics, c.rotation, c.translation) for c in cameras), strict=True
+        )
+        return Views(*(torch.stack(part).double() for part in (intrinsics, rotation, translation)))
 
     def moved(self, step: Tensor, focal_step: Tensor) -> "Views":
         """Rotated and translated by (I,6), with focal lengths longer by the factors exp of (I,)."""

@@ -11,14 +11,13 @@ from torchface.color_space import to_linear, to_srgb
 from torchface.errors import FileFormatError
 from torchface.files.whole_files import all_or_none
 from torchface.geometry.cameras.calibration import CameraCalibration
-from torchface.geometry.cameras.pinhole import Camera
 from torchface.io import load_image, save_calibration, save_pts, save_rig
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.video.video_file import VIDEO_ENDINGS
 from torchface.landmarks import FaceReading
-from torchface.landmarks.images.face_crop import cut_crop
 from torchface.modeling import FitSettings, ImageFit, fit_images, transfer_with_report
+from torchface.modeling.photographs.face_piece import FacePiece
 from torchface.modeling.photographs.image_texture import without_colors
 from torchface.modeling.photographs.landmark_view import JAW
 from torchface.number_checks import checked_count
@@ -68,7 +67,6 @@ from torchface.workflows.named_priors import DEFAULT_PRIOR, load_priors
 from torchface.workflows.rig.actor_rig import check_out
 from torchface.workflows.rig_names import Naming, renamed
 
-_OVER, _MARGIN = 480, 0.45
 _DIMMEST, _BRIGHTEST = 0.25, 2.5  # of what a drawing's light is multiplied by
 _LIGHT = Lighting(occlusion_rays=0)
 _WHITE, _BLACK = (1.0, 1.0, 1.0), (0.0, 0.0, 0.0)
@@ -150,6 +148,7 @@ class FittedHead:
                 "focal length: a guess by the face's perspective; two head models differ in it by a factor of 0.6 to "
                 "1.8 (24 photographs), and in the distance to the camera; give --focal where you know it"
             )
+        lines += [_skin_line(fit)] if len(photographs) > 1 else []
         lines += self.remarks
         most = float(fit.coefficients.abs().max())
         lines.append(f"identity: at most {most:.2f} standard deviations from the mean head in a mode; 3 are rare")
@@ -322,20 +321,20 @@ def _pictures(
 def overlay(fit: ImageFit, view: int, image: Tensor, marks: Tensor, rig: BlendshapeRig | None = None) -> Tensor:
     """A photograph, the head before it with its skin, and landmarks (68,2): found green, fitted red; (3,H,W), cut to
     it."""
-    camera, corner = _cut(fit.cameras[view], marks)
+    piece = FacePiece.around(image, marks)
+    camera, shown = piece.camera(fit.cameras[view]), piece.image
     posed = fit.posed[view]
     if rig is not None:
         weights = torch.zeros(1, len(rig.names))
         weights[0, : fit.weights.shape[1]] = fit.weights[view]
         posed = rig.neutral.with_vertices(rig(weights)[0].detach())
-    shift = torch.cat([torch.eye(2, dtype=torch.float64), -corner[:2, None]], dim=1)
-    piece = cut_crop((255 * image[:3].clamp(0, 1)).round().byte(), corner[2] * shift, _OVER)
     before, drawn = (render(posed, camera, lighting=_LIGHT, background=color) for color in (_WHITE, _BLACK))
-    dotted = with_dots(piece, *((points - corner[:2]) * corner[2] for points in (marks, fit.landmarks[view])))
+    dots = (piece.from_photograph(points) for points in (marks, fit.landmarks[view]))
+    dotted = with_dots((255 * shown).byte(), *dots)
     through = (before - drawn).mean(0)  # the share of what lies behind
-    inner = (fit.landmarks[view, JAW:] - corner[:2]) * corner[2]
-    over = _as_bright(drawn, piece / 255, through < 0.5, inner.amin(0), inner.amax(0)) + through * piece / 255
-    return torch.cat([piece / 255, over, dotted / 255], dim=2)
+    inner = piece.from_photograph(fit.landmarks[view, JAW:])
+    over = _as_bright(drawn, shown, through < 0.5, inner.amin(0), inner.amax(0)) + through * shown
+    return torch.cat([shown, over, dotted / 255], dim=2)
 
 
 def _as_bright(drawn: Tensor, photograph: Tensor, shown: Tensor, low: Tensor, high: Tensor) -> Tensor:
@@ -348,18 +347,21 @@ def _as_bright(drawn: Tensor, photograph: Tensor, shown: Tensor, low: Tensor, hi
     return to_srgb((to_linear(drawn) * max(_DIMMEST, min(seen / max(made, 1e-3), _BRIGHTEST))).clamp(0, 1))
 
 
+def _skin_line(fit: ImageFit) -> str:
+    """Whether several photographs show the head's form by more than landmarks."""
+    found = fit.agreement
+    if found is None:
+        return (
+            "skin: not the same in any two photographs; their expression, light or sharpness differ, or their angles "
+            "are alike: the head's form rests on landmarks. Sharp photographs at rest and in one light, from the front "
+            "and 20 to 30 degrees from both sides, show it better"
+        )
+    moved = float(found.moved[fit.mesh.landmarks.cpu()].norm(dim=1).mean())
+    return (
+        f"skin: {found.matches} places that photographs show together moved the face by {moved:.1f} mm; they lie "
+        f"{found.after:.1f} pixels from the head's (before {found.before:.1f}; a face is 250 pixels wide)"
+    )
+
+
 def _code(color: Tensor) -> str:
     return "#" + "".join(f"{round(255 * channel):02x}" for channel in color.tolist())
-
-
-def _cut(camera: Camera, marks: Tensor) -> tuple[Camera, Tensor]:
-    """The camera of a square piece around the landmarks, and where that lies: left, top, pixels of it a pixel (3,)."""
-    known = marks[torch.isfinite(marks).all(-1)]
-    low, high = known.amin(0), known.amax(0)
-    side = float((high - low).max()) * (1 + 2 * _MARGIN)
-    corner, scale = (low + high) / 2 - side / 2, _OVER / side
-    zoom = torch.eye(3, dtype=torch.float64)
-    zoom[0, 0] = zoom[1, 1] = scale
-    zoom[:2, 2] = -corner * scale
-    piece = Camera(zoom @ camera.intrinsics, camera.rotation, camera.translation, _OVER, _OVER)
-    return piece, torch.cat([corner, torch.tensor([scale], dtype=torch.float64)])

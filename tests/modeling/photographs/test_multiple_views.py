@@ -1,0 +1,206 @@
+"""Photographs of one head from several sides move it to where they show its skin; others move nothing."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import pytest
+import torch
+import trimesh
+from torch import Tensor
+
+from torchface import BlendshapeRig, Mesh
+from torchface.geometry.cameras.pinhole import Camera, look_at
+from torchface.geometry.similarity import similarity_transform
+from torchface.io import load_landmark_points, load_mesh
+from torchface.modeling import FitSettings, HeadModel, fit_images
+from torchface.modeling.photographs.face_piece import FacePiece
+from torchface.modeling.photographs.image_fit import ImageFit
+from torchface.modeling.photographs.multiple_views import Forms, HeldMarks, ShownHead, agreed_skin
+from torchface.modeling.photographs.skin_matches import match_skin
+from torchface.rendering.clay_shading import Lighting, render
+from torchface.synthetic import character, draw_identities, performer
+
+SIZE, YAWS = 400, (-24.0, 0.0, 24.0)
+LIGHT = Lighting(occlusion_rays=0)
+
+
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """A head, what cameras took of it, and where its landmarks are in the pictures."""
+
+    head: Mesh
+    cameras: list[Camera]
+    images: list[Tensor]
+
+    @property
+    def landmarks(self) -> Tensor:
+        places = self.head.vertices[self.head.landmarks].double()
+        return torch.stack([camera.project(places) for camera in self.cameras])
+
+
+def taken(head: Mesh, yaws: Sequence[float] = YAWS) -> Taken:
+    middle = head.vertices[head.landmarks[27:]].double().mean(0)
+    cameras = [look_at(middle, yaw, 3.0, 280.0, SIZE, SIZE, 14.0) for yaw in yaws]
+    return Taken(head, cameras, [render(head, camera, lighting=LIGHT)[:3] for camera in cameras])
+
+
+def person(seed: int) -> Mesh:
+    return character(performer(draw_identities(1, torch.Generator().manual_seed(seed))[0]), size=1024).rig.neutral
+
+
+@pytest.fixture(scope="module")
+def shot() -> Taken:
+    return taken(person(21))
+
+
+def bent(head: Mesh) -> Tensor:
+    """Smooth displacements (V,3) of a head: nose, chin, brow and cheeks of another form, 6 mm out and in."""
+    at = head.vertices[head.landmarks[[30, 8, 27]]].double()
+    cheeks = head.vertices[head.landmarks[[41, 46]]].double() + torch.tensor([0.0, -25.0, 0.0])
+    near = torch.exp(-torch.cdist(head.vertices.double(), torch.cat([at, cheeks])).square() / (2 * 15.0**2))
+    ways = torch.tensor([-6.0, 6.0, 6.0, 6.0, -6.0], dtype=torch.float64)
+    return (near @ ways)[:, None] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+
+
+def to_surface(points: Tensor, mesh: Mesh) -> float:
+    """The mean distance of points (P,3) to a mesh after the best similarity, millimetres."""
+    true = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
+    for _ in range(8):
+        near, _, _ = trimesh.proximity.closest_point(true, points.numpy())
+        points = similarity_transform(points[None], torch.from_numpy(near)[None]).apply(points[None])[0]
+    return float(trimesh.proximity.closest_point(true, points.numpy())[1].mean())
+
+
+def inner_face(mesh: Mesh) -> Tensor:
+    """Skin between the brows, the chin and the eyes' corners, (V,) bool."""
+    inner = mesh.vertices[mesh.landmarks[17:]]
+    low, high = inner.amin(0) - 5.0, inner.amax(0) + 5.0
+    return mesh.regions["face"] & ((mesh.vertices > low) & (mesh.vertices < high))[:, :2].all(1)
+
+
+def wrong_head(shot: Taken, moved: Tensor) -> ShownHead:
+    posed = [shot.head.with_vertices(shot.head.vertices + moved.float())] * len(shot.cameras)
+    return ShownHead(posed, shot.cameras, torch.zeros(0, *moved.shape))
+
+
+def pieces(shot: Taken) -> list[FacePiece]:
+    return [FacePiece.around(image, marks) for image, marks in zip(shot.images, shot.landmarks, strict=True)]
+
+
+def marks(shot: Taken) -> HeldMarks:
+    return HeldMarks(shot.head.landmarks[17:], shot.landmarks[:, 17:], 2.0)
+
+
+def test_matches_are_where_the_true_head_has_them(shot: Taken) -> None:
+    """A place of a bent head's skin shows another one of the true head's: where its ray meets that, others show it."""
+    moved = bent(shot.head)
+    head, cut = wrong_head(shot, moved), pieces(shot)
+    cameras = [piece.camera(camera) for piece, camera in zip(cut, shot.cameras, strict=True)]
+    matches = match_skin(head.posed, cameras, cut, None)
+    assert matches is not None
+    true = trimesh.Trimesh(shot.head.vertices.numpy(), shot.head.faces.numpy(), process=False)
+    own = {int(site): (int(view), at) for site, view, at, mine in zip(
+        matches.site, matches.view, matches.pixels, matches.own, strict=True) if mine}  # fmt: skip
+    rows = (~matches.own).nonzero()[::20, 0]
+    off, before = [], []
+    for row in rows.tolist():
+        view, pixel = own[int(matches.site[row])]
+        camera, other = cameras[view], cameras[int(matches.view[row])]
+        ray = torch.linalg.solve(camera.intrinsics, torch.cat([pixel, pixel.new_ones(1)])) @ camera.rotation.double()
+        hits, _, _ = true.ray.intersects_location(camera.centre[None].numpy(), ray[None].numpy())
+        place = torch.from_numpy(hits)[(torch.from_numpy(hits) - camera.centre).norm(dim=1).argmin()]
+        site = matches.site[row]
+        corners = shot.head.faces[matches.triangles[site]]
+        assumed = (head.posed[0].vertices[corners].double() * matches.barycentric[site][:, None]).sum(0)
+        off.append(float((other.project(place) - matches.pixels[row]).norm()))
+        before.append(float((other.project(place) - other.project(assumed)).norm()))
+    far = torch.tensor(before) > 0.7
+    assert int(far.sum()) > 20
+    assert torch.tensor(off)[far].median() < 0.3 * torch.tensor(before)[far].median()
+    assert torch.tensor(off).median() < 0.3
+
+
+def test_a_bent_head_straightens(shot: Taken) -> None:
+    moved = bent(shot.head)
+    found = agreed_skin(wrong_head(shot, moved), pieces(shot), marks(shot))
+    assert found is not None
+    face = inner_face(shot.head)
+    heads = (shot.head.vertices.double() + by for by in (moved, moved + found.moved))
+    before, after = (to_surface(head[face], shot.head) for head in heads)
+    assert after < 0.55 * before
+    assert found.after < 0.5 * found.before
+
+
+@pytest.mark.parametrize("exact", [True, False])
+def test_a_focal_length_that_is_known_stays(shot: Taken, exact: bool) -> None:
+    longer = torch.tensor([[1.15, 1.0, 1.0], [1.0, 1.15, 1.0], [1.0, 1.0, 1.0]], dtype=torch.float64)
+    middle = shot.head.vertices[shot.head.landmarks[27:]].double().mean(0)
+    cameras = []
+    for camera in shot.cameras:  # further away, and the face as large as before
+        further = camera.translation + 0.15 * (camera.translation + camera.rotation @ middle)
+        cameras.append(replace(camera, intrinsics=longer * camera.intrinsics, translation=further))
+    head = replace(wrong_head(shot, bent(shot.head)), cameras=cameras, focal_deviation=0.0 if exact else 0.3)
+    found = agreed_skin(head, pieces(shot), marks(shot))
+    assert found is not None
+    length = float(found.cameras[0].intrinsics[0, 0] / cameras[0].intrinsics[0, 0])
+    assert abs(length - 1) < 1e-4 if exact else 0.8 < length < 0.93
+
+
+def test_photographs_of_other_skin_move_nothing(shot: Taken) -> None:
+    other = taken(person(8))
+    mixed = replace(shot, images=[shot.images[0], other.images[1], shot.images[2][:, :, :].flip(1)])
+    assert agreed_skin(wrong_head(shot, bent(shot.head)), pieces(mixed), marks(shot)) is None
+
+
+def test_photographs_from_one_angle_or_of_other_expressions_are_not_compared(shot: Taken) -> None:
+    near = taken(shot.head, (-2.0, 0.0, 3.0))
+    assert agreed_skin(wrong_head(near, bent(shot.head)), pieces(near), marks(near)) is None
+    head = wrong_head(shot, bent(shot.head))
+    open_mouth = [
+        mesh.with_vertices(mesh.vertices + 4.0 * k * bent(shot.head).float()) for k, mesh in enumerate(head.posed)
+    ]
+    assert agreed_skin(replace(head, posed=open_mouth), pieces(shot), marks(shot)) is None
+
+
+def test_smooth_forms_vary_as_the_covariance_says(shot: Taken) -> None:
+    """Out of the skin by 3.2 mm, along it by 0.3 of that, in the mean over the face."""
+    forms = Forms.of(shot.head, torch.zeros(0, len(shot.head.vertices), 3))
+    x = torch.randn(2000, forms.count, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    row = int(shot.head.landmarks[33])
+    drawn = torch.stack([forms.field(one)[row] for one in x[:400]])
+    out, along = (drawn @ forms.ways[row, k] / forms.ways[row, k].norm() for k in (0, 1))
+    assert abs(float(out.std()) - 10.0**0.5) < 0.4
+    assert abs(float(along.std()) / float(out.std()) - 0.3) < 0.05
+
+
+@pytest.mark.real
+def test_the_real_scan_photographed_from_three_sides(data: Path, rig: BlendshapeRig, model: HeadModel) -> None:
+    """The face inside its outline, to the scan: nearer by a quarter than what the landmarks alone give."""
+    scan = load_mesh(data / "scans" / "james" / "james.obj")
+    given = load_landmark_points(data / "scans" / "james" / "james.ljson").ibug().double()
+    right = torch.nn.functional.normalize(given[45] - given[36], dim=0)
+    up = given[27] - given[8]
+    up = torch.nn.functional.normalize(up - (up @ right) * right, dim=0)
+    frame = torch.stack([right, up, torch.linalg.cross(right, up)])
+    middle = given[27:].mean(0)
+    upright = scan.with_vertices(((scan.vertices.double() - middle) @ frame.T).float())
+    places = (given - middle) @ frame.T
+    cameras = [look_at(torch.zeros(3).double(), yaw, 3.0, 280.0, SIZE, SIZE, 14.0) for yaw in YAWS]
+    images = [render(upright, camera, lighting=LIGHT)[:3] for camera in cameras]
+    seen = torch.stack([camera.project(places) for camera in cameras])
+
+    def apart(fit: ImageFit) -> float:
+        at = fit.mesh.vertices[rig.neutral.landmarks].double()
+        move = similarity_transform(at[17:][None], places[17:][None])
+        shown = fit.mesh.vertices[inner_face(fit.mesh)].double()
+        return to_surface(move.apply(shown[None])[0], upright)
+
+    found = {
+        way: fit_images(
+            model, rig, seen, (SIZE, SIZE), images, settings=FitSettings(transfers=0, texture_size=0, match_skin=way)
+        )
+        for way in (False, True)
+    }
+    assert found[True].agreement is not None
+    assert apart(found[True]) < 0.75 * apart(found[False])
