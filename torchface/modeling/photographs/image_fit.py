@@ -183,6 +183,7 @@ def fit_images(
         progress("matching the skin between the photographs")
         agreement = _agreement(fit, images, modes[: len(modes) - len(unknown)], vertices[JAW:], settings)
         if agreement is not None:
+            agreement = replace(agreement, moved=with_whole_eyeballs(agreement.moved[None], rig.neutral)[0])
             head = replace(head, mean=mean + agreement.moved.float())
             points = LinearPoints.of(head.mean, torch.cat([modes, deltas]), sites)
             problem, state = replace(problem, points=points), replace(state, views=Views.of(agreement.cameras))
@@ -282,7 +283,8 @@ def _standing_as(template: Mesh, landmarks: Tensor, fit: ImageFit) -> ImageFit:
     for camera in fit.cameras:
         rotation = camera.rotation.double() @ turn.T
         cameras.append(replace(camera, rotation=rotation, translation=camera.translation.double() - rotation @ shift))
-    return replace(fit, mesh=mesh, posed=tuple(posed), cameras=tuple(cameras))
+    agreement = fit.agreement and replace(fit.agreement, moved=fit.agreement.moved @ turn.T, cameras=tuple(cameras))
+    return replace(fit, mesh=mesh, posed=tuple(posed), cameras=tuple(cameras), agreement=agreement)
 
 
 def _in_place(rig: BlendshapeRig, mean: Tensor) -> Tensor:

@@ -97,7 +97,8 @@ def agreed_skin(
     """
     forms = Forms.of(head.posed[0], head.modes)
     cameras = tuple(piece.camera(camera) for piece, camera in zip(pieces, head.cameras, strict=True))
-    state = _State(torch.zeros(forms.count, dtype=torch.float64), cameras)
+    lenses = torch.zeros(1 if head.shared_focal else len(cameras), dtype=torch.float64)
+    state = _State(torch.zeros(forms.count, dtype=torch.float64), cameras, lenses)
     held = marks.matches(head.posed[0], pieces)
     sites, off = 0, list[float]()  # before each round's steps
     for _ in range(_ROUNDS):
@@ -166,6 +167,7 @@ class _State:
 
     forms: Tensor  # coefficients of the forms, (K+3M,)
     cameras: tuple[Camera, ...]  # of the pieces
+    longer: Tensor  # logarithms of focal lengths beside those at first, (1,) or (I,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,12 +206,12 @@ class _Bundle:
         """One of Gauss-Newton, for the forms, the cameras' poses and the focal lengths."""
         forms, views = len(state.forms), len(state.cameras)
         lenses = forms + 6 * views
-        count = lenses + (1 if self.head.shared_focal else views)
-        H, g = torch.zeros(count, count, dtype=torch.float64), torch.zeros(count, dtype=torch.float64)
+        count = lenses + len(state.longer)
+        H = torch.zeros(count, count, dtype=torch.float64)
         prior = torch.full((count,), 1e-9, dtype=torch.float64)
         prior[:forms], prior[lenses:] = 1.0, 1 / max(self.head.focal_deviation, _EXACT) ** 2
         H.diagonal().add_(prior)
-        g[:forms] = state.forms
+        g = prior * torch.cat([state.forms, prior.new_zeros(6 * views), state.longer])
         at, far = self._at(state), _OFF * self.disagreement(state)
         for view, camera in enumerate(state.cameras):
             rows = (self.matches.view == view).nonzero()[:, 0]
@@ -231,7 +233,8 @@ class _Bundle:
             g[into] += J.T @ (off * weight).flatten()
         step = -torch.linalg.solve(H, g)
         each = zip(state.cameras, step[forms:lenses].view(views, 6), step[lenses:].expand(views), strict=True)
-        return _State(state.forms + step[:forms], tuple(_moved(*one) for one in each))
+        cameras = tuple(_moved(*one) for one in each)
+        return _State(state.forms + step[:forms], cameras, state.longer + step[lenses:])
 
 
 def _moved(camera: Camera, by: Tensor, longer: Tensor) -> Camera:
