@@ -37,7 +37,7 @@ from torchface.shape_names import mirror
 
 _MAX_ANGLE = 100.0  # degrees from the camera; a face rotated further shows none of its inner landmarks
 _MAX_MISFIT = 0.25  # of the face's size; the mean face fits landmarks of strong expressions better than this
-_HELD = 2.0  # deviations of a landmark beside hundreds of matches: neighbours err alike
+_HELD = 1.0  # deviations of a landmark beside hundreds of matches
 _SHOWS = 0.5  # millimetres at a landmark by which a shape has to show for its personal form to matter
 
 
