@@ -9,7 +9,7 @@ from torch import Tensor
 
 from planted.photographed_heads import SIZE, person
 from torchface import Attachment, BlendshapeRig, Mesh
-from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
+from torchface.errors import AlignmentError, ArgumentTypeError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io import load_identity_modes, load_image, load_landmark_points
 from torchface.io.landmarks.dlib_xml import load_dlib_faces
@@ -37,6 +37,12 @@ def test_pixels_of_another_picture(rig: BlendshapeRig, model: HeadModel, seen: T
         fit_images(model, rig, seen, (320, 256))
     with pytest.raises(ValueRangeError, match="expected pixels in an image of 1280 x 1024"):
         fit_images(model, rig, seen / 1280, SIZE)
+
+
+def test_photographs_of_bytes(rig: BlendshapeRig, model: HeadModel, seen: Tensor) -> None:
+    images = [torch.zeros(3, SIZE[1], SIZE[0], dtype=torch.uint8)] * len(seen)
+    with pytest.raises(ArgumentTypeError, match=r"images: found torch.uint8, expected floating-point .*\[0,1\]"):
+        fit_images(model, rig, seen, SIZE, images)
 
 
 def test_another_order(rig: BlendshapeRig, model: HeadModel, seen: Tensor) -> None:

@@ -110,7 +110,7 @@ def fit_images(
         rig: template with the model's topology. Its annotated landmarks are seen, or the model's where it has none.
         landmarks: in iBUG's order, (I,68,2), pixels, x right, y down; NaN for missing.
         image_size: (width, height) of all photographs, or one for each.
-        images: the photographs, (3,H,W) each, for the head's skin; see ``photographed_skin``.
+        images: the photographs, (3,H,W) in [0,1] each, for the head's skin; see ``photographed_skin``.
         camera: focal length in pixels (the thesis takes 6000), or K (3,3) or (I,3,3); taken as exact unless
             ``settings.focal_deviation`` gives its deviation. Estimated if absent.
         settings: the noise of landmarks, transfers of shapes, the skin; see ``FitSettings``.
@@ -121,6 +121,7 @@ def fit_images(
 
     Raises:
         ShapeError: the landmarks are not (I,68,2), or sizes do not fit.
+        ArgumentTypeError: images that are no floating-point numbers.
         TopologyError: model and rig have other triangles.
         ValueRangeError: too few landmarks in a view, or landmarks outside its image.
         AlignmentError: a face seen from behind, or landmarks that are not a face's in iBUG's order.

@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from torchface.errors import ShapeError, TopologyError, ValueRangeError
+from torchface.errors import ArgumentTypeError, ShapeError, TopologyError, ValueRangeError
 from torchface.modeling.morphable.head_model import HeadModel
 from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.landmark_view import JAW, LANDMARKS
@@ -84,11 +84,14 @@ def checked_sizes(landmarks: Tensor, image_size: tuple[int, int] | Sequence[tupl
 
 
 def check_images(images: Sequence[Tensor], sizes: Tensor) -> None:
-    """Refuses photographs of other sizes than (I,2)."""
+    """Refuses photographs of other sizes than (I,2), and those that are no floating-point numbers."""
     found = [tuple(image.shape) for image in images]
     expected = [(3, int(height), int(width)) for width, height in sizes.tolist()]
     if found != expected:
         raise ShapeError(f"images: found {found}, expected {expected}, as in image_size")
+    for image in images:
+        if not image.is_floating_point():
+            raise ArgumentTypeError(f"images: found {image.dtype}, expected floating-point numbers in [0,1]")
 
 
 def _check_view(i: int, marks: Tensor, size: Tensor) -> None:

@@ -93,7 +93,7 @@ def agreed_skin(
         parts: what each photograph shows.
 
     Returns:
-        None where fewer than 150 places match, or they agree little better after than before.
+        None where there are fewer than 150 matches, or they agree little better after than before.
     """
     forms = Forms.of(head.posed[0], head.modes)
     cameras = tuple(piece.camera(camera) for piece, camera in zip(pieces, head.cameras, strict=True))
