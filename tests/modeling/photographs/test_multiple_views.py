@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -21,6 +22,7 @@ from torchface.modeling.photographs.multiple_views import Forms, HeldMarks, Show
 from torchface.modeling.photographs.skin_matches import match_skin
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import character, draw_identities, performer
+from torchface.workflows.fit.photograph_rig import _skin_line
 
 SIZE, YAWS = 400, (-24.0, 0.0, 24.0)
 LIGHT = Lighting(occlusion_rays=0)
@@ -162,6 +164,13 @@ def test_photographs_from_one_angle_or_of_other_expressions_are_not_compared(sho
         mesh.with_vertices(mesh.vertices + 4.0 * k * bent(shot.head).float()) for k, mesh in enumerate(head.posed)
     ]
     assert agreed_skin(replace(head, posed=open_mouth), pieces(shot), marks(shot)) is None
+
+
+def test_a_head_that_agrees_already_stays(shot: Taken) -> None:
+    """And its report does not say that photographs show other skin."""
+    assert agreed_skin(wrong_head(shot, torch.zeros_like(bent(shot.head))), pieces(shot), marks(shot)) is None
+    said = _skin_line(SimpleNamespace(agreement=None))  # type: ignore[arg-type]
+    assert "agrees with it already" in said
 
 
 def test_smooth_forms_vary_as_the_covariance_says(shot: Taken) -> None:

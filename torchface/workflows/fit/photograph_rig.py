@@ -352,9 +352,9 @@ def _skin_line(fit: ImageFit) -> str:
     found = fit.agreement
     if found is None:
         return (
-            "skin: not the same in any two photographs; their expression, light or sharpness differ, or their angles "
-            "are alike: the head's form rests on landmarks. Sharp photographs at rest and in one light, from the front "
-            "and 20 to 30 degrees from both sides, show it better"
+            "skin: moved nothing: the head agrees with it already, or the photographs' expression, light or sharpness "
+            "differ, or their angles are alike; the head's form rests on landmarks. Sharp photographs at rest and in "
+            "one light, from the front and 20 to 30 degrees from both sides, show it better"
         )
     moved = float(found.moved[fit.mesh.landmarks.cpu()].norm(dim=1).mean())
     return (
