@@ -185,7 +185,7 @@ def test_smooth_forms_vary_as_the_covariance_says(shot: Taken) -> None:
     assert abs(float(along.std()) / float(out.std()) - 0.3) < 0.05
 
 
-def test_a_moved_head_keeps_whole_eyeballs_and_stands_as_the_rig(shot: Taken, model: HeadModel) -> None:
+def test_what_photographs_agree_on_stands_as_the_rig(shot: Taken, model: HeadModel) -> None:
     """A rig that stands 50 mm further and turned by 20 degrees."""
     seen = taken(shot.head.with_vertices(shot.head.vertices + bent(shot.head).float()), YAWS[1:])
     rig = performer(texture=False).select(["jawOpen"])
@@ -196,10 +196,6 @@ def test_a_moved_head_keeps_whole_eyeballs_and_stands_as_the_rig(shot: Taken, mo
         model, rig, seen.landmarks, (SIZE, SIZE), seen.images, settings=FitSettings(transfers=0, texture_size=0)
     )
     assert fit.agreement is not None
-    for side in ("left", "right"):
-        moved = fit.agreement.moved[rig.neutral.regions[f"eyeball_{side}"]]
-        assert float(moved.norm(dim=1).max()) > 0.05
-        assert float((moved - moved.mean(0)).abs().max()) < 1e-3
     nose = fit.mesh.vertices[fit.mesh.landmarks[30]]
     for camera, agreed in zip(fit.cameras, fit.agreement.cameras, strict=True):
         assert float((camera.project(nose[None].double()) - agreed.project(nose[None].double())).norm()) < 1e-3

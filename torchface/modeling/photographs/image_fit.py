@@ -184,7 +184,6 @@ def fit_images(
         progress("matching the skin between the photographs")
         agreement = _agreement(fit, images, modes[: len(modes) - len(unknown)], vertices[JAW:], settings)
         if agreement is not None:
-            agreement = replace(agreement, moved=with_whole_eyeballs(agreement.moved[None], rig.neutral)[0])
             head = replace(head, mean=mean + agreement.moved.float())
             points = LinearPoints.of(head.mean, torch.cat([modes, deltas]), sites)
             problem, state = replace(problem, points=points), replace(state, views=Views.of(agreement.cameras))
