@@ -18,8 +18,8 @@ from torchface.io import load_landmark_points, load_mesh
 from torchface.modeling import FitSettings, HeadModel, fit_images
 from torchface.modeling.photographs.face_piece import FacePiece
 from torchface.modeling.photographs.image_fit import ImageFit
-from torchface.modeling.photographs.multiple_views import Forms, HeldMarks, ShownHead, agreed_skin
-from torchface.modeling.photographs.skin_matches import match_skin
+from torchface.modeling.photographs.multiple_views import Forms, HeldMarks, ShownHead, agreed_skin, behind_lids
+from torchface.modeling.photographs.skin_matches import match_skin, skin_vertices
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import character, draw_identities, performer
 from torchface.workflows.fit.photograph_rig import _skin_line
@@ -183,6 +183,21 @@ def test_smooth_forms_vary_as_the_covariance_says(shot: Taken) -> None:
     out, along = (drawn @ forms.ways[row, k] / forms.ways[row, k].norm() for k in (0, 1))
     assert abs(float(out.std()) - 10.0**0.5) < 0.4
     assert abs(float(along.std()) / float(out.std()) - 0.3) < 0.05
+
+
+def test_eyeballs_do_not_bend_and_stay_behind_their_lids(shot: Taken) -> None:
+    forms = Forms.of(shot.head, torch.zeros(0, len(shot.head.vertices), 3))
+    x = 0.5 * torch.randn(forms.count, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    at, skin = shot.head.vertices.double(), skin_vertices(shot.head)
+    moved = behind_lids(shot.head, forms.field(x))
+    for side in ("left", "right"):
+        ball = shot.head.regions[f"eyeball_{side}"]
+        assert float((moved[ball] - moved[ball][0]).norm(dim=1).max()) < 1e-9
+        assert float((forms.field(x)[ball] - moved[ball]).norm(dim=1).max()) > 0.5
+        middle, centre = at[ball].mean(0), (at + moved)[ball].mean(0)
+        lids = skin & ((at - middle).norm(dim=1) < 1.2 * (at - middle).norm(dim=1)[ball].max()) & (at[:, 2] > middle[2])
+        before, after = (at - middle)[lids].norm(dim=1), (at + moved - centre)[lids].norm(dim=1)
+        assert float((after - before).min()) > -0.5
 
 
 def test_what_photographs_agree_on_stands_as_the_rig(shot: Taken, model: HeadModel) -> None:

@@ -15,6 +15,7 @@ from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.mesh import Mesh
 from torchface.modeling.photographs.face_piece import FacePiece
 from torchface.modeling.photographs.skin_matches import SkinMatches, match_skin, skin_vertices
+from torchface.part_materials import EYEBALL, part_material
 
 _ROUNDS, _STEPS = 3, 3  # matches are looked for anew; Gauss-Newton with them
 # Of what is not known of a head: millimetres over which it is alike, and how large it is, wide and fine.
@@ -22,6 +23,7 @@ _SMOOTH = ((30.0, 3.0), (12.0, 1.0))
 _ALONG = 0.3  # as much along the skin, where landmarks say what is where
 _KNOTS, _MODES, _LEAST_VARIANCE = 300, 150, 1e-2
 _FAR, _OFF = 3.0, 2.0  # deviations, and medians of all, beyond which a match hardly counts
+_LIDS = 1.25  # radii of an eyeball about its middle, where lids end
 _EXACT = 1e-6  # deviation of a focal length's logarithm that is taken as known
 # Of a result that counts: how many match, how far they are off (pixels), and beside before. By rendered people: where
 # expressions differ they stay off by 0.6 pixels and more, where they are alike by 0.2 to 0.4.
@@ -116,7 +118,26 @@ def agreed_skin(
         return None
     back = zip(pieces, state.cameras, head.cameras, strict=True)
     seen = tuple(piece.whole(camera, like) for piece, camera, like in back)
-    return SkinAgreement(forms.field(state.forms), seen, sites, off[0], off[-1])
+    moved = behind_lids(head.posed[0], forms.field(state.forms))
+    return SkinAgreement(moved, seen, sites, off[0], off[-1])
+
+
+def behind_lids(mesh: Mesh, field: Tensor) -> Tensor:
+    """Displacements (V,3) that bend no annotated eyeball: each follows its lids, and back to where none is inside."""
+    rest, field = mesh.vertices.detach().cpu().double(), field.clone()
+    skin = skin_vertices(mesh)
+    for region, mask in mesh.regions.items():
+        ball = mask.cpu()
+        if part_material(region) is not EYEBALL or not bool(ball.any()):
+            continue
+        middle = rest[ball].mean(0)
+        off = (rest - middle).norm(dim=1)
+        lids = skin & (off < _LIDS * off[ball].amax()) & (rest[:, 2] > middle[2])
+        if bool(lids.any()):
+            way = field[lids].mean(0)
+            nearer = off[lids] - (rest[lids] + field[lids] - middle - way).norm(dim=1)
+            field[ball] = way - nearer.amax().clamp(min=0) * way.new_tensor([0.0, 0.0, 1.0])
+    return field
 
 
 @dataclass(frozen=True, eq=False)
