@@ -176,12 +176,15 @@ class WrinkleWeights(nn.Module):
 
     def _value(self, scores: Tensor) -> Tensor:
         """What regression says of scores (R,T,q), (R,T,M)."""
-        # In double precision: coefficients of 50 and more cancel to weights of at most 1.
-        given, scores, centers = scores, scores.double(), self.centers.double()
+        # In double precision, which Apple's GPUs lack: coefficients of 50 and more cancel to weights of at most 1.
+        exact = scores.dtype if scores.device.type == "mps" else torch.float64
+        given, scores = scores, scores.to(exact)
+        centers, linear, coefficients, sharpness, bias = (
+            part.to(exact) for part in (self.centers, self.linear, self.coefficients, self.sharpness, self.bias)
+        )
         own, other = scores.square().sum(-1, keepdim=True), centers.square().sum(-1)[:, None]
         apart = (own + other - 2 * scores @ centers.transpose(1, 2)).clamp(min=0)
-        near = (-apart * self.sharpness.double()).exp()
-        value = scores @ self.linear.double() + near @ self.coefficients.double() + self.bias.double()
+        value = scores @ linear + (-apart * sharpness).exp() @ coefficients + bias
         return value.to(given)
 
     def _set_rows(self, neutral: Tensor, poses: Tensor, shares: Tensor) -> None:
