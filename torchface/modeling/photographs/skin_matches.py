@@ -62,7 +62,7 @@ def match_skin(
         posed: the head, one mesh a photograph, millimetres.
         cameras: of the pieces.
         pieces: the face in each photograph.
-        parts: what the photographs show: sites are on skin, lips and brows; anywhere if absent.
+        parts: what the photographs show: sites are on skin, lips and brows; below the brows if absent.
 
     Source: Kroeger et al. 2016 (optical flow by dense inverse search).
     """
@@ -71,6 +71,8 @@ def match_skin(
     places = FacePlaces.of(posed[0])
     neck = (places.beyond > _NECK) & (places.place[:, 1] < 0.5 * places.chin[1])  # it turns beside the head
     skin, faces = skin_vertices(posed[0]) & ~neck, posed[0].faces.cpu()
+    if parts is None:  # hair hangs over the forehead and beside the face
+        skin &= (places.out < 1) & (places.place[:, 1] < places.brows)
     cosines = torch.stack([
         surface.shown_in(piece.image, camera).cosine
         for surface, piece, camera in zip(surfaces, pieces, cameras, strict=True)
