@@ -61,7 +61,7 @@ class ImageFit:
         iris: the irises' colour, (3,); None where no photograph shows it.
         fringe: whether hair hangs over the forehead.
         agreement: what the skin that several photographs show moved the head by; None with one photograph, without
-            images, or where they do not agree.
+            images, where they do not agree, or the head agrees with them already.
     """
 
     mesh: Mesh
