@@ -108,7 +108,7 @@ def read_capture(folder: Path, neutral: Path | None) -> Capture:
     for sequence in sequences:
         if not torch.equal(sequence.faces, mesh.faces):
             raise TopologyError(
-                f"{sequence.name}: found {len(sequence.faces)} triangles, expected the {len(mesh.faces)} of "
+                f"{folder / sequence.name}: found {len(sequence.faces)} triangles, expected the {len(mesh.faces)} of "
                 f"{rest.name}, in their order: all frames must be of one topology"
             )
     read = {str(file.relative_to(folder)): file for file in sorted(folder.rglob("*")) if file.is_file()}

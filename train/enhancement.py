@@ -17,10 +17,16 @@ from torch import Tensor
 from torchface import TorchfaceError, zoo
 from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
 from torchface.enhancement.detail.low_pass import WAVELENGTH
-from torchface.errors import ValueRangeError
+from torchface.errors import AlignmentError, ValueRangeError
 from torchface.io import MeshSequence
 from torchface.workflows.animated_meshes import DEFAULT_FPS
-from torchface.workflows.enhance.coarse_animation import OWN_HEAD_MM, SAMPLED, distance_at_rest, residual_notes
+from torchface.workflows.enhance.coarse_animation import (
+    NO_HEAD_MM,
+    OWN_HEAD_MM,
+    SAMPLED,
+    distance_at_rest,
+    residual_notes,
+)
 
 from .captured_sequences import Capture, gather, performed, read_capture, read_pairs
 from .enhancement_figures import draw
@@ -97,6 +103,7 @@ def train(settings: Settings, run: Run) -> EnhancementModel:
         if pairs is not None and settings.coarse is not None:
             coarse = [part.coarse for part in shown if part.coarse is not None]
             _warn_of_another_person(pairs, coarse, settings.coarse)
+            _check_places(shown, settings)
     tested = 0 if test is None else len(test)
     progress(f"{len(known)} frames of {learned} of {count} sequences to learn from, {tested} to test on")
     mesh = capture.neutral
@@ -143,6 +150,22 @@ def _warn_of_another_person(capture: Capture, gathered: list[MeshSequence], fold
             f"{', '.join(far[:5])} (root mean square), expected at most {OWN_HEAD_MM:g} mm: they show another "
             "person, whose head would be learned as an expression, or no face at rest",
             stacklevel=3,
+        )
+
+
+def _check_places(shown: list[Shown], settings: Settings) -> None:
+    """Refuses coarse heads elsewhere than the captured ones: the way between would be learned as their error."""
+    ways = [
+        (part.coarse.read(number, number + 1) - part.truth.read(number, number + 1)).mean((0, 1)).norm()
+        for part in shown
+        if part.coarse is not None
+        for number in range(0, len(part), max(1, len(part) // SAMPLED))
+    ]
+    apart = float(torch.stack(ways).median())
+    if apart > NO_HEAD_MM:
+        raise AlignmentError(
+            f"{settings.coarse}: found heads {apart:.0f} mm from those of {settings.frames} (median of the frames), "
+            f"expected the same places: at most {NO_HEAD_MM:g} mm"
         )
 
 

@@ -162,11 +162,26 @@ def test_what_a_coarse_animation_lacks_of_the_same_frames_is_learned(folder, mon
     with pytest.raises(ValueRangeError, match=r"coarse: found no sequence for d.safetensors, expected its 9 frames"):
         train(settings(folder, coarse=coarse))
     lower = rest + (0.6 * frames(0) + 0.4 * frames(2) - rest) * 2 / 3
+    np.savez(coarse / "d.npz", vertices=lower.numpy(), faces=sheet().faces.flip(0).numpy())
+    with pytest.raises(TopologyError, match=r"coarse.d\.npz: found 1058 triangles"):
+        train(settings(folder, coarse=coarse))
     np.savez(coarse / "d.npz", vertices=lower.numpy(), faces=sheet().faces.numpy())
     model = train(settings(folder, coarse=coarse))
     assert zoo.describe(folder.parent / "model").metrics["learned: missing detail, of the coarse frames'"] < 0.1
     left = (model(shown[1]) - frames(1)).square().mean().sqrt()
     assert float(left) < 0.1 * float((shown[1] - frames(1)).square().mean().sqrt())
+
+
+def test_a_coarse_animation_in_another_place_is_refused(folder, monkeypatch):
+    """Its way from the captured heads would be learned as an error, and the share that is left look small."""
+    monkeypatch.setattr(recipe, "draw", lambda *a: None)
+    coarse, mesh = folder.parent / "coarse", sheet()
+    coarse.mkdir()
+    for name, vertices in zip("abcd", (*map(frames, range(3)), 0.6 * frames(0) + 0.4 * frames(2)), strict=True):
+        moved = vertices + torch.tensor([0.0, 100.0, 0.0])
+        np.savez(coarse / f"{name}.npz", vertices=moved.numpy(), faces=mesh.faces.numpy())
+    with pytest.raises(AlignmentError, match=r"coarse: found heads 100 mm from those of .*capture"):
+        train(settings(folder, coarse=coarse))
 
 
 def test_the_rate_is_that_of_the_files_and_of_all_of_them(folder, monkeypatch):

@@ -49,3 +49,14 @@ def test_a_sequence_that_the_keyframes_meet_at_its_neutrals_adds_no_jump(extend:
     times = nearest_timing(keyframes, captured, torch.ones(4), 13, 12.0, extend=extend)
     assert float(times.diff().max()) < 1.1 * float(EASED.diff().max())
     assert float(times.diff()[[0, -1]].max()) < 2 * float(EASED.diff()[0])
+
+
+@pytest.mark.parametrize("extend", [False, True])
+@pytest.mark.parametrize("held", [1, 2, 5])
+def test_poses_that_both_lie_at_a_sequences_rest_find_no_motion_there(extend: bool, held: int) -> None:
+    """Frames that are equal in every digit lie at one place of the way: of them the later pose may meet an earlier."""
+    smile = random_points(4, 4, 9).reshape(4, 9)
+    keyframes = torch.stack([0 * smile, -smile])
+    captured = torch.cat([torch.zeros(held, 4, 9, dtype=torch.float64), EASED[1:, None, None] * smile])
+    times = nearest_timing(keyframes, [captured], torch.ones(4), 13, 12.0, extend=extend)
+    torch.testing.assert_close(times, torch.linspace(0, 1, 13).to(times), atol=1e-6, rtol=0)

@@ -129,7 +129,8 @@ def _on_one_motion(pair: Tensor, captured: Tensor) -> tuple[Tensor, float]:
     waited = _WAIT * size * (moments[1] - moments[0][:, None])
     cost = distances[0][:, None] + distances[1] + _DETOUR * (way - size).clamp(min=0) + waited
     first, last = divmod(int(torch.where(way >= 0, cost, torch.inf).argmin()), len(steps))
-    times = torch.stack([moments[0, first], moments[1, last]])
+    # Frames that are equal have one place on the way, and the later pose may meet the earlier of them.
+    times = torch.stack([moments[0, first], moments[1, last].clamp(min=moments[0, first])])
     return times, float(distances[0, first] + distances[1, last])
 
 
