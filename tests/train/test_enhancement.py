@@ -64,8 +64,10 @@ def settings(folder: Path, **other: object) -> Settings:
 
 
 def test_all_forms_of_sequences_are_read_alike(folder):
+    (folder / "a" / "._004.ply").write_bytes(b"\0\5\x16\7Mac OS X")
     found = {sequence.name: sequence for sequence in read_capture(folder, None).sequences}
     assert list(found) == ["a", "b.npz", "d.safetensors", "c"]
+    assert found["a"].count == 9
     for name, kind in {"a": 0, "b.npz": 1, "c": 2}.items():
         assert torch.allclose(found[name].read(2, 7), frames(kind)[2:7], atol=1e-4)
 

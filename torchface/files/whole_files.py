@@ -7,7 +7,7 @@ import re
 import shutil
 import stat
 import sys
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from pathlib import Path
@@ -34,6 +34,11 @@ def check_there(path: Path, what: str = "file") -> None:
         meant = Path(os.path.expanduser(bare))  # Path.expanduser refuses a user whom nobody knows
         hint = f"; did you mean {quote(str(meant))}?" if meant != path and os.path.exists(meant) else ""
         raise FileFormatError(f"{path}: found no such {what}, expected an existing one{hint}")
+
+
+def visible_files(folder: Path, endings: Collection[str]) -> list[Path]:
+    """What a folder holds with one of the endings, in order of the names; not hidden files, as macOS's ``._a.obj``."""
+    return sorted(path for path in folder.iterdir() if path.suffix.lower() in endings and path.name[0] != ".")
 
 
 def numbered_order(path: Path) -> list[tuple[int, int, str]]:

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, NameMismatchError, ValueRangeError
-from torchface.files.whole_files import check_there, numbered_order
+from torchface.files.whole_files import check_there, numbered_order, visible_files
 from torchface.io import MeshSequence, load_animation, load_mesh, load_rig, load_take
 from torchface.io.head_models.array_files import ArrayFile
 from torchface.io.length_units import millimetres_per
@@ -102,9 +102,8 @@ def is_animation(path: Path) -> bool:
     beside animations.
     """
     if path.is_dir():
-        files = sorted(path.iterdir())
-        meshes = [file for file in files if file.suffix.lower() in (*MESH_ENDINGS, *SCENE_ENDINGS)]
-        if len(meshes) == 1 and any(map(_is_take, files)):
+        meshes = visible_files(path, (*MESH_ENDINGS, *SCENE_ENDINGS))
+        if len(meshes) == 1 and any(map(_is_take, path.iterdir())):
             return False
         return bool(meshes) and not _moves(file for file in meshes if file.suffix.lower() in SCENE_ENDINGS)
     ending = path.suffix.lower()
@@ -207,8 +206,7 @@ def _of_arrays(path: Path, rig: BlendshapeRig | None, unit: str | None) -> Anima
 
 
 def _of_folder(folder: Path, rig: BlendshapeRig | None, unit: str | None) -> AnimatedMesh:
-    meshes = (file for file in folder.iterdir() if file.suffix.lower() in (*MESH_ENDINGS, *SCENE_ENDINGS))
-    files = sorted(meshes, key=numbered_order)
+    files = sorted(visible_files(folder, (*MESH_ENDINGS, *SCENE_ENDINGS)), key=numbered_order)
     if not files:
         raise FileFormatError(f"{folder}: found no mesh, expected files ending in {', '.join(MESH_ENDINGS)} or .glb")
     return meshes_over_time(folder, files, rig, unit)

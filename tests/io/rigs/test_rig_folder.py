@@ -26,6 +26,8 @@ def save_folder(rig: BlendshapeRig, folder: Path) -> None:
 def test_a_folder_of_obj_files_is_a_rig(tmp_path: Path) -> None:
     rig = sheet_rig()
     save_folder(rig, tmp_path / "rig")
+    for hidden in ("._Face_Neutral.obj", "._jawOpen.obj"):  # as macOS leaves them beside files on foreign disks
+        (tmp_path / "rig" / hidden).write_bytes(b"\0\5\x16\7Mac OS X")
     found = load_rig(tmp_path / "rig")
     assert found.names == tuple(sorted(rig.names))
     assert (found.deltas - rig.select(found.names).deltas).abs().max() < 1e-4

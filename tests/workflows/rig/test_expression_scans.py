@@ -28,6 +28,7 @@ def touch(folder: Path, *names: str) -> None:
 
 def test_names_tell_shapes_and_weights_in_any_spelling(tmp_path: Path) -> None:
     touch(tmp_path, "jawOpen=0.6+mouthSmileLeft=0.5.obj", "browInnerUp.ply", "Neutral.obj", "jawOpen.ljson", "a.txt")
+    touch(tmp_path, "._Neutral.obj", "._browInnerUp.ply")
     first, second = expressions_in(tmp_path, NAMES)
     torch.testing.assert_close(first.weights, torch.tensor([0, 1.0, 1, 0]))
     torch.testing.assert_close(second.weights, torch.tensor([0.6, 0, 0, 0.5]))

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from torchface.errors import AlignmentError, FileFormatError, NameMismatchError
 from torchface.files.documents import read_json, write_json
-from torchface.files.whole_files import all_or_none, check_writable, made_folder, read_file
+from torchface.files.whole_files import all_or_none, check_writable, made_folder, read_file, visible_files
 from torchface.geometry.meshes.normal_maps import DetailMaps
 from torchface.geometry.meshes.unit_check import check_unit, extent
 from torchface.geometry.meshes.vertex_order import check_vertex_order
@@ -52,7 +52,7 @@ def load_obj_folder(folder: str | Path, unit: str = "mm", neutral: str | None = 
         [10.0, 0.0, 0.0]
     """
     folder = Path(folder)
-    files = {path.stem: path for path in sorted(folder.iterdir()) if path.suffix.lower() == ".obj"}
+    files = {path.stem: path for path in visible_files(folder, [".obj"])}
     notes = _read_notes(folder)
     if neutral is None and notes is not None and NEUTRAL in files:
         neutral = NEUTRAL
@@ -139,8 +139,8 @@ def _check_names(rig: BlendshapeRig, folder: Path) -> None:
     for name in names:
         if not name or Path(name).name != name or name.startswith(".") or "\0" in name or name.lower() == NEUTRAL:
             raise NameMismatchError(f"{folder}: found a shape {name!r}, expected file names; write a .glb instead")
-    there = [path.name for path in folder.glob("*.obj")] if folder.is_dir() else []
-    others = [name for name in sorted(there) if name[:-4] not in (NEUTRAL, *names)]
+    there = [path.name for path in visible_files(folder, [".obj"])] if folder.is_dir() else []
+    others = [name for name in there if name[:-4] not in (NEUTRAL, *names)]
     if others:
         raise FileFormatError(
             f"{folder}: found OBJ files of another rig ({', '.join(others[:3])}), expected an empty or a new folder"

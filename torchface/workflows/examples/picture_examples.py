@@ -9,7 +9,7 @@ import torch
 from torchface.capture.anybody import ExampleShapes, paper_expressions, shown_examples
 from torchface.capture.anybody.examples.example_expressions import NEUTRAL
 from torchface.errors import FileFormatError, NameMismatchError
-from torchface.files.whole_files import numbered_order
+from torchface.files.whole_files import numbered_order, visible_files
 from torchface.io.images.image_files import IMAGE_ENDINGS, load_image
 from torchface.landmarks import NoFaceError, find_landmarks
 from torchface.progress import Progress, silent
@@ -49,7 +49,7 @@ def picture_examples(
 def _files(pictures: Sequence[Path]) -> list[Path]:
     if len(pictures) == 1 and pictures[0].is_dir():
         folder = pictures[0]
-        files = sorted((p for p in folder.iterdir() if p.suffix.lower() in IMAGE_ENDINGS), key=numbered_order)
+        files = sorted(visible_files(folder, IMAGE_ENDINGS), key=numbered_order)
         if not files:
             raise FileFormatError(f"{folder}: found no picture, expected files ending in {', '.join(IMAGE_ENDINGS)}")
     else:

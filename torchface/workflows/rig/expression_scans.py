@@ -10,6 +10,7 @@ from scipy import sparse
 from torch import Tensor
 
 from torchface.errors import AlignmentError, FileFormatError, NameMismatchError, ShapeError, ValueRangeError
+from torchface.files.whole_files import visible_files
 from torchface.geometry.meshes.operators import edges, vertex_normals
 from torchface.io.tables.csv_table import TableReader
 from torchface.mesh import Mesh
@@ -89,7 +90,7 @@ def neutral_in(folder: Path) -> Path | None:
 
 
 def _scans(folder: Path) -> list[Path]:
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in SCAN_ENDINGS and path.is_file())
+    return [path for path in visible_files(folder, SCAN_ENDINGS) if path.is_file()]
 
 
 def _by_table(table: Path, names: Sequence[str]) -> list[Expression]:
@@ -176,7 +177,7 @@ def check_expression(actor: BlendshapeRig, weights: Tensor, found: Tensor, seen:
         raise AlignmentError(
             f"shows something else: {named:.2g} mm (root mean square, across the skin) from what it is named for, "
             f"{still:.2g} mm from the face at rest, expected clearly less than that; the name is another expression's, "
-            "or the scan shows another person or a face at rest"
+            "the scan shows another person or a face at rest, or the neutral scan is not at rest (--pose)"
         )
 
 
