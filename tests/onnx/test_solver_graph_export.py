@@ -4,6 +4,7 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,8 +27,14 @@ EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "solve_onnx.py"
 WITHOUT_TORCH = "import sys, runpy; sys.modules['torch'] = None; sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0])"
 
 
+@cache
+def opened(path: Path) -> onnxruntime.InferenceSession:
+    """A file's session, which takes longer than all frames do."""
+    return onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+
+
 def run(path: Path, *inputs: Tensor) -> Tensor:
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    session = opened(path)
     names = (entry.name for entry in session.get_inputs())
     (weights,) = session.run(["weights"], {name: value.numpy() for name, value in zip(names, inputs, strict=True)})
     return torch.from_numpy(weights)
@@ -78,7 +85,7 @@ def test_an_infinite_marker_is_one_that_is_not_seen(written: SolverReport, turne
 
 
 def test_the_metadata_says_what_goes_in_and_out(written: SolverReport, turned_bumps: MarkerSolver) -> None:
-    loaded = onnxruntime.InferenceSession(written.path, providers=["CPUExecutionProvider"])
+    loaded = opened(written.path)
     assert {i.name: i.shape for i in loaded.get_inputs()} == {"markers": ["batch", 36, 3], "previous": ["batch", 10]}
     assert {o.name: o.shape for o in loaded.get_outputs()} == {"weights": ["batch", 10]}
     metadata = loaded.get_modelmeta().custom_metadata_map

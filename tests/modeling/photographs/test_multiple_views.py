@@ -24,7 +24,7 @@ from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import character, draw_identities, performer
 from torchface.workflows.fit.photograph_rig import _skin_line
 
-SIZE, YAWS = 400, (-24.0, 0.0, 24.0)
+SIZE, YAWS = 288, (-24.0, 0.0, 24.0)
 LIGHT = Lighting(occlusion_rays=0)
 
 
@@ -49,7 +49,7 @@ def taken(head: Mesh, yaws: Sequence[float] = YAWS) -> Taken:
 
 
 def person(seed: int) -> Mesh:
-    return character(performer(draw_identities(1, torch.Generator().manual_seed(seed))[0]), size=1024).rig.neutral
+    return character(performer(draw_identities(1, torch.Generator().manual_seed(seed))[0]), size=512).rig.neutral
 
 
 @pytest.fixture(scope="module")

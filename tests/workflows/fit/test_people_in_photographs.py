@@ -27,6 +27,9 @@ from torchface.workflows.fit.picture_checks import picture_lines
 from torchface.workflows.fit.video_pictures import video_pictures
 from torchface.workflows.named_heads import load_head_model, matching
 
+HEAD = FitSettings(texture_size=0, transfers=0, match_skin=False)
+"""Of a head alone, of which remarks and verdicts speak."""
+
 PEOPLE = ("einstein.jpg", "lfpw_1.png", "lfpw_2.png", "takeo.ppm")
 """The second and third are one woman."""
 
@@ -121,7 +124,7 @@ def test_given_landmarks_that_do_not_fit_are_said(people: People, tmp_path: Path
 
 @pytest.mark.real
 def test_a_dark_photograph_makes_a_poor_result_and_a_name_that_says_so_does_not(data: Path, tmp_path: Path) -> None:
-    folder, settings = data / "images" / "people", PhotographSettings(fit=FitSettings(texture_size=0), focal=700.0)
+    folder, settings = data / "images" / "people", PhotographSettings(fit=HEAD, focal=700.0)
     photograph, marks = load_image(folder / "lfpw_2.png"), [folder / "lfpw_2.pts"]
     for name, light, poor in (("too dark room.png", 1.0, False), ("a.png", 0.2, True)):
         save_image(light * photograph, tmp_path / name)
@@ -131,7 +134,7 @@ def test_a_dark_photograph_makes_a_poor_result_and_a_name_that_says_so_does_not(
 
 @pytest.mark.real
 def test_a_grey_photograph_is_warned_of_where_its_landmarks_are_given(data: Path, tmp_path: Path) -> None:
-    folder, settings = data / "images" / "people", PhotographSettings(fit=FitSettings(texture_size=0), focal=700.0)
+    folder, settings = data / "images" / "people", PhotographSettings(fit=HEAD, focal=700.0)
     photograph, marks = load_image(folder / "lfpw_2.png"), [folder / "lfpw_2.pts"]
     save_image(photograph.mean(0).expand(3, -1, -1).contiguous(), tmp_path / "a.png")
     made = fit_photographs([tmp_path / "a.png"], marks, None, tmp_path / "rig.glb", settings)
@@ -141,7 +144,7 @@ def test_a_grey_photograph_is_warned_of_where_its_landmarks_are_given(data: Path
 
 @pytest.mark.real
 def test_landmarks_of_another_photograph_make_a_poor_result(data: Path, tmp_path: Path) -> None:
-    folder, settings = data / "images" / "people", PhotographSettings(fit=FitSettings(texture_size=0))
+    folder, settings = data / "images" / "people", PhotographSettings(fit=HEAD)
     made = fit_photographs([folder / "lfpw_1.png"], [folder / "lfpw_2.pts"], None, tmp_path / "rig.glb", settings)
     assert made.verdict().startswith("result: poor, the given landmarks are not on a face"), made.verdict()
     (line,) = made.remarks
@@ -159,7 +162,7 @@ def test_a_smile_does_not_make_another_person(data: Path, tmp_path: Path) -> Non
     photographs = [tmp_path / "rest.png", tmp_path / "smile.png"]
     for path, number in zip(photographs, (4, 54), strict=True):
         save_image(frames[number] / 255, path)
-    settings = PhotographSettings(fit=FitSettings(texture_size=0))
+    settings = PhotographSettings(fit=HEAD)
     made = fit_photographs(photographs, [], "head", tmp_path / "rig.glb", settings)
     assert not any("different people" in line for line in made.remarks), made.remarks
     assert any(line.startswith("focal length: a guess") for line in made.lines())
@@ -174,7 +177,7 @@ def test_a_film_with_a_cut_to_another_person_is_warned_of(data: Path, tmp_path: 
     height, width = other[0].shape[1:]
     small = torch.nn.functional.interpolate(torch.stack(man).float() / 255, (height, width), mode="area")
     film = write_video([small, torch.stack(other).float() / 255], tmp_path / "cut.mkv", 12.0)
-    settings = PhotographSettings(fit=FitSettings(texture_size=0))
+    settings = PhotographSettings(fit=HEAD)
     made = fit_photographs([Path(film.path)], [], "head", tmp_path / "rig.glb", settings)
     assert any("may show different people" in line for line in made.remarks), made.remarks
 
