@@ -12,7 +12,8 @@ from torchface.rendering.raycast import RayCaster
 
 _SIDE = 320  # pixels of the picture
 _LEAST_WIDTH, _LEAST_HEIGHT = 0.12, 0.03  # of the opening, in sides of the picture
-_AROUND, _DEEP = 121, 0.1  # pixels over which skin closes the opening, and sides that the opening is deeper than that
+_COARSE = 2  # pixels: what closes the opening is smooth, and costs the fourth power of its size
+_AROUND, _DEEP = 61, 0.1  # of these over which skin closes the opening, and sides that the opening is deeper than that
 _EDGE = 2  # pixels from the opening to the skin that is taken for the lid's edge
 _SMOOTH = 5  # columns
 
@@ -59,7 +60,8 @@ def eye_opening(vertices: Tensor, skin: Tensor, middle: Tensor, span: float) -> 
     depth = points[..., 2].masked_fill((hits.triangle < 0).reshape(_SIDE, _SIDE), behind).clamp(min=behind)
     front = depth.numpy().astype(np.float32)
     around = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (_AROUND, _AROUND))
-    pit = (cv2.morphologyEx(front, cv2.MORPH_CLOSE, around) - front > _DEEP * span).astype(np.uint8)
+    closed = cv2.morphologyEx(front[::_COARSE, ::_COARSE], cv2.MORPH_CLOSE, around)
+    pit = (closed.repeat(_COARSE, 0).repeat(_COARSE, 1) - front > _DEEP * span).astype(np.uint8)
     _, labels = cv2.connectedComponents(pit, connectivity=4)
     centre = slice(_SIDE // 2 - _SIDE // 8, _SIDE // 2 + _SIDE // 8)
     counts = np.bincount(labels[centre, centre].ravel())
