@@ -9,16 +9,24 @@ STAMP := $(VENV)/.installed
 
 .PHONY: demo test test-blender test-cluster bench fuzz lint style types imports licences docs gallery app clean
 
-$(STAMP): pyproject.toml constraints.txt
-	@echo "installing into $(VENV), a few minutes"
+# Bytecode is written of what is imported, a quarter of all: compiling the rest takes longer than installing it.
+INSTALL := $(RUN) -m pip install --quiet --no-compile --constraint constraints.txt --editable
+
+$(VENV)/.made:
 	$(PYTHON) -m venv $(VENV)
-	$(RUN) -m pip install --quiet --constraint constraints.txt --editable .
 	touch $@
 
-$(VENV)/.installed-%: $(STAMP)
-	@echo "installing what '$*' needs"
-	$(RUN) -m pip install --quiet --constraint constraints.txt --editable '.[test,$*]'
+$(STAMP): $(VENV)/.made pyproject.toml constraints.txt
+	@echo "installing into $(VENV), a few minutes"
+	$(INSTALL) .
 	touch $@
+
+# What tests import is compiled once, before several processes do it at the same time.
+$(VENV)/.installed-%: $(VENV)/.made pyproject.toml constraints.txt
+	@echo "installing torchface and what '$*' needs into $(VENV), a few minutes"
+	$(INSTALL) '.[test,$*]'
+	PYTHONDONTWRITEBYTECODE= $(RUN) -c 'import matplotlib.pyplot, onnxscript.optimizer, sklearn.svm, torch._dynamo, torch.onnx, trimesh'
+	touch $(STAMP) $@
 
 # Three processes of one thread each for two cores, as browsers and programs are waited for; the longest files first, and what is
 # costly to make once (a synthetic video, a browser) stays in one.
