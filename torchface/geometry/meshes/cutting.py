@@ -31,8 +31,8 @@ class CutMesh:
         """Edges (E,2), the smaller vertex first, cut at shares (E,) of their way; their triangles fall in pieces."""
         count, faces = self.shares.shape[0], self.faces
         key, order = (pairs[:, 0] * count + pairs[:, 1]).sort()
-        sides = torch.stack([faces, faces.roll(-1, 1)], -1)
-        wanted = sides.amin(-1) * count + sides.amax(-1)
+        other = faces.roll(-1, 1)
+        wanted = torch.minimum(faces, other) * count + torch.maximum(faces, other)
         place = torch.searchsorted(key, wanted).clamp(max=len(key) - 1)
         new = torch.where(key[place] == wanted, count + order[place], -1)
         number = (new >= 0).sum(1)

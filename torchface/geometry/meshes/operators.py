@@ -45,22 +45,26 @@ def vertex_normals(vertices: Tensor, faces: Tensor) -> Tensor:
 
 def edges(faces: Tensor) -> Tensor:
     """Every edge once, (E,2), smaller vertex id first, sorted."""
-    pairs = torch.cat([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    if len(pairs) == 0:
-        return pairs
+    if len(faces) == 0:
+        return faces[:, :2]
     # One number a pair: sorting those is ten times faster than sorting rows.
-    low, high = pairs.amin(1), pairs.amax(1)
+    low, high = _ordered(faces, faces.roll(-1, 1))
     span = high.max() + 1
     keys = (low * span + high).unique()
     return torch.stack([keys // span, keys % span], dim=1)
+
+
+def _ordered(first: Tensor, second: Tensor) -> tuple[Tensor, Tensor]:
+    """Ends of edges, the smaller vertex id first; ``amin`` over pairs of whole numbers takes fifty times as long."""
+    return torch.minimum(first, second), torch.maximum(first, second)
 
 
 def border_edges(faces: Tensor) -> Tensor:
     """Mask (F,3): whether the edge opposite each corner belongs to no other triangle."""
     if len(faces) == 0:
         return torch.zeros_like(faces, dtype=torch.bool)
-    ends = torch.stack([faces[:, [1, 2]], faces[:, [2, 0]], faces[:, [0, 1]]], dim=1)
-    keys = ends.amin(-1) * (faces.max() + 1) + ends.amax(-1)
+    low, high = _ordered(faces.roll(-1, 1), faces.roll(-2, 1))
+    keys = low * (faces.max() + 1) + high
     _, place, count = keys.unique(return_inverse=True, return_counts=True)
     return count[place] == 1
 

@@ -47,7 +47,7 @@ def _shift(rest: Tensor, goal: Tensor, ends: Tensor, across: float, other: str) 
     count = len(rest)
     stretch = max(_LEAST_STRETCH, -(-count // _STRETCHES))
     pairs = ends[ends.diff(dim=1)[:, 0].abs() < stretch]
-    vectors, of = rest[pairs].diff(dim=1)[:, 0], pairs.amin(1) // stretch
+    vectors, of = rest[pairs].diff(dim=1)[:, 0], pairs[:, 0] // stretch
     lengths = vectors.norm(dim=-1).clamp(min=_SHORTEST * across)
     edges_in = of.bincount(minlength=-(-count // stretch))
 
