@@ -87,12 +87,27 @@ def test_a_head_is_decoded(head: HeadModel, tmp_path: Path) -> None:
     assert (metadata["units"], metadata["licence"]) == ("millimetres", "MIT")
 
 
-def test_offsets_come_with_any_pose(regression: ExpressionRegression, tmp_path: Path) -> None:
-    export_model(regression, tmp_path / "r.onnx", FACTS)
+def exported_by_command(model: nn.Module, folder: Path, capsys: pytest.CaptureFixture[str]) -> Path:
+    """The file that the command makes of a model's folder, and says where it lies."""
+    card = zoo.ModelCard("MIT", "noise", {"error": 1.5}, "none")
+    zoo.save_model(model, folder / "model", card)
+    out = folder / "model.onnx"
+    main(["export", str(folder / "model"), "--out", str(out), "--quiet"])
+    assert str(out) in capsys.readouterr().out.replace("\n", "")
+    metadata = onnxruntime.InferenceSession(out).get_modelmeta().custom_metadata_map
+    assert metadata["sha256"] == zoo.describe(folder / "model").sha256
+    assert (metadata["data"], metadata["licence"]) == ("noise", "MIT")
+    return out
+
+
+def test_offsets_come_with_any_pose(
+    regression: ExpressionRegression, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = exported_by_command(regression, tmp_path, capsys)
     turn = torch.linalg.qr(noise(5, 3, 3, seed=7))[0]
     turn = turn * torch.linalg.det(turn)[:, None, None]
     neutrals = (regression.neutral_mean + noise(5, *regression.neutral_mean.shape, seed=5)) @ turn + 80.0
-    found, metadata = run(tmp_path / "r.onnx", {"neutrals": neutrals})
+    found, metadata = run(path, {"neutrals": neutrals})
     torch.testing.assert_close(found["offsets"], regression.offsets(neutrals.double()).float(), rtol=0, atol=1e-3)
     still = regression.offsets(neutrals).abs().amax((0, 1, 3)) == 0
     assert still.any()
@@ -121,18 +136,10 @@ def test_the_bank_finds_what_the_detector_finds(detector: UVLandmarkDetector, tm
 
 
 def test_the_command_exports_models_of_a_folder(
-    head: HeadModel, regression: ExpressionRegression, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    head: HeadModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    kinds = {"head": "head_decoder", "expressions": "expression_regression"}
-    for name, model in zip(kinds, (head, regression), strict=True):
-        zoo.save_model(model, tmp_path / name, zoo.ModelCard("MIT", "noise", {"error": 1.5}, "none"))
-        out = tmp_path / f"{name}.onnx"
-        main(["export", str(tmp_path / name), "--out", str(out), "--quiet"])
-        assert str(out) in capsys.readouterr().out.replace("\n", "")
-        metadata = onnxruntime.InferenceSession(out).get_modelmeta().custom_metadata_map
-        assert metadata["task"] == kinds[name]
-        assert metadata["sha256"] == zoo.describe(tmp_path / name).sha256
-        assert metadata["data"] == "noise"
+    _, metadata = run(exported_by_command(head, tmp_path, capsys), {"shape": noise(1, 5), "color": noise(1, 5)})
+    assert metadata["task"] == "head_decoder"
     with pytest.raises(SystemExit):
         main(["export", "nobody", "--out", str(tmp_path / "x.onnx"), "--quiet"])
     assert not (tmp_path / "x.onnx").exists()
