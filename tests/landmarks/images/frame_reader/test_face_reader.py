@@ -68,7 +68,7 @@ class Run(nn.Module):
 
 @pytest.fixture(scope="module")
 def quick(reader: FaceReader) -> FaceReader:
-    """For films: its networks run in ONNX Runtime, as those of programs do; PyTorch takes far longer."""
+    """Its networks run in ONNX Runtime, as those of programs do; PyTorch takes far longer."""
     found, detector = copy(reader), graph_detector()
     found._modules = {**reader._modules}
     found.boxes = Run(detector.detector.network)
@@ -95,8 +95,8 @@ class Webcam:
 
 
 @pytest.fixture
-def webcam(reader: FaceReader) -> Webcam:
-    return Webcam(reader)
+def webcam(quick: FaceReader) -> Webcam:
+    return Webcam(quick)
 
 
 def test_eyes_are_read_as_the_library_reads_them(portrait: tuple[Tensor, Tensor], reader: FaceReader) -> None:
@@ -128,8 +128,8 @@ def column(face: FaceReading) -> float:
     return float(face.landmarks[:, 0].mean())
 
 
-def test_a_face_is_followed_as_the_library_follows_it(webcam: Webcam, portrait: tuple[Tensor, Tensor]) -> None:
-    network = zoo.get_model("landmark_network")
+def test_a_face_is_followed_as_the_library_follows_it(reader: FaceReader, portrait: tuple[Tensor, Tensor]) -> None:
+    webcam, network = Webcam(reader), zoo.get_model("landmark_network")
     tracker = LandmarkTracker(CropFinder(network, network.size, network.margin), detector=shipped_detector())
     head, truth = portrait
     for left in (60, 66, 72, 95, 95):
@@ -260,10 +260,10 @@ def test_a_plain_wall_is_no_face_for_long(
     ],
     ids=["beside", "passing", "alike", "slow", "near", "before", "alike before"],
 )
-def test_it_stays_with_a_person_before_whom_another_passes(quick: FaceReader, film: dict[str, Any]) -> None:
+def test_it_stays_with_a_person_before_whom_another_passes(webcam: Webcam, film: dict[str, Any]) -> None:
     """Reader and tracker alike: never for two frames with the other, soon with the first again; others are counted."""
     crossing, fps = crossing_film(**film), film.get("fps", 30)
-    tracker, webcam, away = quick_tracker(fps), Webcam(quick), torch.zeros(2, len(crossing.frames))
+    tracker, away = quick_tracker(fps), torch.zeros(2, len(crossing.frames))
     for i, frame in enumerate(crossing.frames):
         for row, found in enumerate((webcam.step(frame, 1 / fps), tracker.step(frame))):
             away[row, i] = abs(float(found.landmarks[:, 0].mean()) - float(crossing.columns[i]))
@@ -284,16 +284,14 @@ def test_one_of_two_boxes_that_overlap_is_not_mistaken_for_good() -> None:
     assert (away[-20:].abs() < 2).all()
 
 
-def test_who_stays_before_another_is_followed_in_the_end(quick: FaceReader) -> None:
-    webcam = Webcam(quick)
+def test_who_stays_before_another_is_followed_in_the_end(webcam: Webcam) -> None:
     frames = crossing_film(stays=10.0, after=0, fps=10).frames
     seen = [column(webcam.step(frame, 0.1)) for frame in frames]
     assert all(one != one for one in seen[27:74])  # for five seconds
     assert seen[-7] == seen[-7]
 
 
-def test_a_person_who_passes_before_another_is_kept(quick: FaceReader) -> None:
-    webcam = Webcam(quick)
+def test_a_person_who_passes_before_another_is_kept(webcam: Webcam) -> None:
     frames = crossing_film(larger=1.3).frames[5:]  # the nearer is the larger, and so the one that is followed
     columns = [column(webcam.step(frame)) for frame in frames]
     assert min(columns) == pytest.approx(columns[-1], abs=2)
