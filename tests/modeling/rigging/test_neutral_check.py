@@ -26,7 +26,7 @@ def actor() -> BlendshapeRig:
 
 @pytest.fixture(scope="module")
 def people() -> list[Mesh]:
-    drawn = draw_identities(8, torch.Generator().manual_seed(3))
+    drawn = draw_identities(5, torch.Generator().manual_seed(3))
     return [neutral_head(one, texture=False) for one in drawn]
 
 
