@@ -1,6 +1,7 @@
 """Shapes of the lower face: jaw, lips and mouth, in millimetres that follow the head's own jaw and mouth."""
 
 import math
+from functools import cache
 
 import torch
 from scipy.interpolate import PchipInterpolator
@@ -9,7 +10,7 @@ from torch import Tensor
 from torchface.synthetic.head.handle_weights import LIP_HANDLES, HandleWeights, handle_weights
 from torchface.synthetic.head.identity import Anatomy, bump, mirrored, ramp, sculpted_vertices
 from torchface.synthetic.head.topology import MOUTH_CONTACT, topology
-from torchface.synthetic.head.upper_face_shapes import free_skin
+from torchface.synthetic.head.upper_face_shapes import Place, free_skin
 
 JAW_ANGLE = math.radians(19.0)
 _HANDLE = torch.arange(LIP_HANDLES)
@@ -195,11 +196,17 @@ class Mouth:
         moved = offset @ (about_y @ about_x).T - offset + torch.tensor(translation, dtype=torch.float64) * self.reach
         return self.weights.jaw[:, None] * moved
 
-    def push(self, centre: tuple[float, float, float], width: tuple[float, float, float], way: Tensor) -> Tensor:
+    def push(self, centre: Place, width: Place, way: Tensor) -> Tensor:
         """Left skin near a point of the sculpture moved along ``way`` (3,), as far as it does not follow the lips."""
-        free = (1 - self.weights.lips.sum(1)).clamp(0, 1) * free_skin(self.head)
-        amount = (bump(self.mean, centre, width) - 0.02).clamp(min=0) * ramp(self.mean[:, 0], -6, 10) * free
-        return amount[:, None] * way * self.size
+        return _pushed(centre, width)[:, None] * way * self.size
+
+
+@cache
+def _pushed(centre: Place, width: Place) -> Tensor:
+    """How much of a push each vertex takes, (V,): alike in all heads."""
+    mean = sculpted_vertices()
+    free = (1 - handle_weights().lips.sum(1)).clamp(0, 1) * free_skin()
+    return (bump(mean, centre, width) - 0.02).clamp(min=0) * ramp(mean[:, 0], -6, 10) * free
 
 
 def _between(places: Lips) -> Tensor:

@@ -1,6 +1,7 @@
 """Shapes of the upper face: lids that slide over the eyeball, eye rotation, brows, nose and cheeks."""
 
 import math
+from functools import cache
 
 import torch
 from torch import Tensor
@@ -121,10 +122,11 @@ def _rotated_eye(head: Anatomy, pitch: float, yaw: float) -> Tensor:
     return delta
 
 
-def free_skin(head: Anatomy) -> Tensor:
+@cache
+def free_skin() -> Tensor:
     """1 where brow and cheek motion may go: not on lid edges, eyeballs, sockets or inside the mouth, (V,)."""
     t = topology()
-    free = torch.ones(len(head.vertices), dtype=torch.float64)
+    free = torch.ones(t.count, dtype=torch.float64)
     share = torch.tensor([1, 0.9, 0.6, 0.3, 0.12, 0.04, 0.0, 0.0] + [0.0] * 8, dtype=torch.float64)[:, None]
     for side in (0, 1):
         free[both_sides(t.rings["eye"])[side]] = share.expand(-1, 32)
@@ -136,18 +138,21 @@ def free_skin(head: Anatomy) -> Tensor:
     return free
 
 
-def _push(
-    head: Anatomy,
-    centre: tuple[float, float, float],
-    width: tuple[float, float, float],
-    way: tuple[float, float, float],
-    one_side: bool = True,
-) -> Tensor:
-    """Skin near a point of the sculpture moved along ``way`` (millimetres, left side; x is mirrored)."""
+Place = tuple[float, float, float]
+
+
+@cache
+def _pushed(centre: Place, width: Place, one_side: bool) -> Tensor:
+    """How much of a push the skin near a point of the sculpture takes, (V,): alike in all heads."""
     p = sculpted_vertices()
     left = ramp(p[:, 0], -9, 9) if one_side else torch.ones(len(p), dtype=p.dtype)
     amount = bump(p, centre, width)
-    amount = torch.where(amount > 0.02, amount - 0.02, 0.0) * left * free_skin(head)
+    return torch.where(amount > 0.02, amount - 0.02, 0.0) * left * free_skin()
+
+
+def _push(head: Anatomy, centre: Place, width: Place, way: Place, one_side: bool = True) -> Tensor:
+    """Skin near a point of the sculpture moved along ``way`` (millimetres, left side; x is mirrored)."""
+    p, amount = sculpted_vertices(), _pushed(centre, width, one_side)
     direction = torch.tensor(way, dtype=p.dtype) * torch.stack(
         [torch.tanh(p[:, 0] / 5), torch.ones(len(p)), torch.ones(len(p))], dim=1
     )
