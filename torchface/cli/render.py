@@ -25,6 +25,7 @@ def render(
     """Render a mesh or rig from several sides into one image, by ray casting; no graphics driver is needed.
 
     An animated file is shown at rest, or in a frame of its animation by --take with the same file and --frame.
+    Detail maps of shapes are not shown; the pages of `torchface view` and `live` show them.
 
     Args:
         path: A mesh or rig: .glb, USD, .obj, .ply, .stl, .off, a folder of OBJ files, or ICT-FaceKit's FaceXModel

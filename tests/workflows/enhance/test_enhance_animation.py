@@ -253,7 +253,7 @@ def test_a_full_disk_is_told_and_leaves_nothing_half(
     settings = replace(PLAIN, given=InputSettings(rig=actor.folder / "rig.glb"))
     with monkeypatch.context() as patch:
         patch.setattr(enhanced_frames.shutil, "disk_usage", lambda path: type("Usage", (), {"free": 1000}))
-        with pytest.raises(FileFormatError, match=r"found 0.0 GB free, expected 0.0 for 12 frames"):
+        with pytest.raises(FileFormatError, match=r"found 0\.1 MB free, expected 0\.3 for 12 frames"):
             enhance_animation(actor.folder / "weights.csv", actor.model, tmp_path, settings)
     monkeypatch.setattr(enhanced_frames, "_MOST_A_PIECE", 4)
     appended = MeshSequenceWriter.append

@@ -61,3 +61,38 @@ def test_markers_that_do_not_fit_are_named(actor: Actor, tmp_path: Path) -> None
     save_take(Take(FPS, markers=Track(labels, points[:, torch.randperm(60)])), mixed)
     with pytest.raises(AlignmentError):
         coarse(actor, mixed, tmp_path, attachment=sites)
+
+
+def test_two_exchanged_labels_are_named(actor: Actor, tmp_path: Path) -> None:
+    """Two labels of sixty, near to each other, half a face apart, and so far apart that the take is refused."""
+    points, labels = actor.attachment.on(actor.mesh.faces, actor.frames), actor.attachment.labels or ()
+    apart = torch.cdist(points[0], points[0])
+    for distance in 8.0, 50.0, float(apart.max()):
+        first, second = divmod(int((apart - distance).abs().argmin()), 60)
+        names = " and ".join(labels[i] for i in sorted((first, second)))
+        order = list(range(60))
+        order[first], order[second] = second, first
+        save_take(Take(FPS, markers=Track(labels, points[:, order])), tmp_path / "swap.trc")
+        if distance > 100:
+            with pytest.raises(AlignmentError, match=f"the labels {names} seem to be exchanged"):
+                coarse(actor, tmp_path / "swap.trc", tmp_path, attachment=actor.folder / "attachment.json")
+            continue
+        found = coarse(actor, tmp_path / "swap.trc", tmp_path, attachment=actor.folder / "attachment.json")
+        assert [line for line in found.notes if f"the labels {names} seem to be exchanged" in line]
+        assert not any("--neutral" in line for line in found.notes)
+    save_take(Take(FPS, markers=Track(labels, points)), tmp_path / "right.trc")
+    found = coarse(actor, tmp_path / "right.trc", tmp_path, attachment=actor.folder / "attachment.json")
+    assert not any("exchanged" in line for line in found.notes)
+
+
+def test_a_marker_that_is_astray_in_one_frame_counts_as_not_seen_there(actor: Actor, tmp_path: Path) -> None:
+    points, labels = actor.attachment.on(actor.mesh.faces, actor.frames), actor.attachment.labels or ()
+    points[7, 3] += torch.tensor([500.0, 500.0, 500.0])
+    points[10:] = torch.nan
+    save_take(Take(FPS, markers=Track(labels, points)), tmp_path / "take.trc")
+    found = coarse(actor, tmp_path / "take.trc", tmp_path, attachment=actor.folder / "attachment.json")
+    assert any(f"{labels[3]} in frame 7 by 86" in line and "left out" in line for line in found.notes)
+    assert found.shown(0, FRAMES).isnan().any(-1).nonzero().tolist() == [[7, 3]]
+    assert float((found.read(7, 8) - actor.frames[7]).norm(dim=-1).max()) < 5
+    assert torch.equal(found.read(10, 11), found.read(9, 10))
+    assert any("and held at the take's ends" in line for line in found.notes)

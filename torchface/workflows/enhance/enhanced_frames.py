@@ -49,7 +49,7 @@ def check_space(out: Path, frames: int, vertices: int, colors: bool) -> None:
     )
     if free < wanted:
         raise FileFormatError(
-            f"{out}: found {free / 1e9:.1f} GB free, expected {wanted / 1e9:.1f} for {frames} frames of {vertices} "
+            f"{out}: found {free / 1e6:,.1f} MB free, expected {wanted / 1e6:,.1f} for {frames} frames of {vertices} "
             "vertices; make room, or write to another disk (--out)"
         )
 

@@ -1,5 +1,6 @@
 """Markers as an animation of the model's dense mesh."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -25,6 +26,8 @@ from torchface.workflows.marker_input import MarkerOptions, read_markers
 _SAME_SIZE = 0.05
 _MOST_AT_REST_MM = 15.0
 _FAR_MM = 3.0
+_EXCHANGED = 0.5  # two labels are exchanged where that leaves less than this part of their distances from their sites
+_ASTRAY_MM = 100.0  # from its site, the head's motion taken out: no face moves a marker so far
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,18 +104,32 @@ def marker_animation(
     markers, gap_notes = _without_gaps(placed(pose, take.markers.values), path)
     if attachment.residual is not None:
         markers = markers - attachment.residual.to(markers)
-    rest, offsets = shell.rest, _distance_at_rest(shell, markers)
+    rest = shell.rest
+    away = _from_sites(rest, markers)
+    offsets = float(away.square().sum(-1).nanmean(-1).sqrt().quantile(0.05))
+    labels = attachment.labels or ()
+    exchanged = _exchanged(rest, away, labels)
+    if offsets > _MOST_AT_REST_MM:
+        raise AlignmentError(
+            f"{path}: found markers {offsets:.1f} mm (root mean square) from their sites where they come nearest, "
+            f"expected at most {_MOST_AT_REST_MM:g}; "
+            + ("; ".join(exchanged) or "the attachment or the rig is another one's, or labels are mixed up")
+        )
+    astray = away.norm(dim=-1) > _ASTRAY_MM  # not of what is NaN
+    if astray.any():
+        frame, marker = divmod(int(away.norm(dim=-1).nan_to_num(0.0).argmax()), len(labels))
+        gap_notes.append(
+            f"warning: {int(astray.sum())} samples lie more than {_ASTRAY_MM:g} mm from their sites, at worst "
+            f"{labels[marker]} in frame {frame} by {float(away[frame, marker].norm()):.0f} mm; they are left out"
+        )
+        markers = markers.masked_fill(astray[..., None], torch.nan)
     if neutral is not None:
         seen = markers[neutral]
         still = rigid_motion(rest.double(), seen[None].double()).inverse().apply(seen[None].double())[0].float()
         rest = torch.where(torch.isfinite(still), still, rest)
-    if offsets > _MOST_AT_REST_MM:
-        raise AlignmentError(
-            f"{path}: found markers {offsets:.1f} mm (root mean square) from their sites where they come nearest, "
-            f"expected at most {_MOST_AT_REST_MM:g}; the attachment or the rig is another one's, or labels are mixed up"
-        )
     site_notes = [f"{len(attachment.triangles)} markers, {offsets:.2f} mm (root mean square) from their sites at rest"]
-    if offsets > 3.0 and neutral is None:
+    site_notes += [f"warning: {line}" for line in exchanged]
+    if offsets > 3.0 and neutral is None and not exchanged:
         site_notes.append(
             f"warning: at rest the markers lie {offsets:.1f} mm from their sites; a frame with the face at rest "
             "(--neutral) or the attachment of this take (torchface attach) would keep that out of the motion"
@@ -172,12 +189,23 @@ def _without_gaps(markers: Tensor, path: Path) -> tuple[Tensor, list[str]]:
     return filled, [
         f"warning: {int((~enough).sum())} of {len(markers)} frames (the first {first}) show fewer than {LEAST_POINTS} "
         "markers; they are interpolated from the frames before and after"
+        + ("" if enough[0] and enough[-1] else ", and held at the take's ends")
     ]
 
 
-def _distance_at_rest(shell: ThinShell, markers: Tensor) -> float:
-    """Root mean square distance of the markers from their sites in the frames where they come nearest, millimetres."""
-    few = markers[:: max(1, len(markers) // 200)].double()
-    pose = rigid_motion(shell.rest.double(), few)
-    off = (pose.inverse().apply(few) - shell.rest.double()).square().sum(-1).nanmean(-1).sqrt()
-    return float(off.quantile(0.05))
+def _from_sites(rest: Tensor, markers: Tensor) -> Tensor:
+    """Ways (T,M,3) of markers from their sites at rest, the head's motion taken out."""
+    return rigid_motion(rest.double(), markers.double()).inverse().apply(markers.double()) - rest.double()
+
+
+def _exchanged(rest: Tensor, away: Tensor, labels: Sequence[str]) -> list[str]:
+    """Words on each two markers that stand at each other's sites in the frame that is nearest to rest."""
+    own = away[int(away.square().sum(-1).nanmean(-1).nan_to_num(torch.inf).argmin())]
+    apart = torch.cdist(rest.double() + own, rest.double())
+    off = own.norm(dim=-1)
+    found = (apart + apart.T < _EXCHANGED * (off[:, None] + off)) & (torch.minimum(off[:, None], off) > _FAR_MM)
+    return [
+        f"the labels {labels[a]} and {labels[b]} seem to be exchanged: the markers lie {float(off[a]):.1f} mm "
+        "from their own sites, and on each other's; rename them (--labels)"
+        for a, b in found.triu(1).nonzero().tolist()
+    ]
