@@ -87,3 +87,10 @@ def test_a_broken_corrective_is_an_error_and_no_rig_without_shapes(
         with pytest.raises(FileFormatError, match=message):
             read()
     assert not (tmp_path / "out.obj").exists()
+
+
+def test_a_pose_may_be_one_text_and_names_may_have_blanks() -> None:
+    assert pose_weights(["Kiefer auf=1 b=.5", "目 を=-2"]) == {"Kiefer auf": 1, "b": 0.5, "目 を": -2}
+    for word in ("", "a=1 b", "a = 1"):
+        with pytest.raises(ValueRangeError, match="expected NAME=NUMBER"):
+            pose_weights([word])

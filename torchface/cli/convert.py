@@ -39,7 +39,7 @@ def convert(
     from torchface.workflows.posed_mesh import pose_weights
 
     with progress_bars(quiet) as progress:
-        pose = pose_weights(" ".join(at).split(), "--at")
+        pose = pose_weights(at, "--at")
         done = convert_file(source, out, unit, part, names, progress, pose, reduce)
     shapes = 0 if done.rig is None else len(done.rig.names)
     frames = "" if done.take is None else f", {len(done.take)} frames at {done.take.rate}"

@@ -1,5 +1,6 @@
 """A mesh or a posed rig from whatever file it lies in."""
 
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -35,9 +36,10 @@ class Posed:
 
 
 def pose_weights(words: Sequence[str], option: str = "--weights") -> dict[str, float]:
-    """``["jawOpen=0.5"]`` as a dictionary; errors name the option that the words are of."""
+    """``["jawOpen=0.5"]`` as a dictionary, also of several in one text; errors name the option that they are of."""
     weights = {}
-    for word in words:
+    # Names may have blanks: a weight ends at the first one behind its "=".
+    for word in [part for text in words for part in re.findall(r"\S[^=]*=\S+|\S+", text) or [text]]:
         name, equals, number = word.partition("=")
         try:
             weights[name] = float(number)

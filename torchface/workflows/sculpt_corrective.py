@@ -45,7 +45,7 @@ def sculpt_corrective(
     if source.rig is None:
         raise FileFormatError(f"{path}: found a mesh without shapes, expected a rig")
     rig = source.rig
-    weights = pose_row(rig, pose_weights(" ".join(at).split(), "--at"), "--at")
+    weights = pose_row(rig, pose_weights(at, "--at"), "--at")
     with torch.no_grad():
         shown = rig(weights[None])[0]
     placed = checked_sculpt(sculpt, load_mesh(sculpt, options.unit), rig, shown, options.align)
