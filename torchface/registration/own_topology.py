@@ -24,7 +24,7 @@ def as_it_is(template: Mesh, head: Mesh) -> Registration:
     mesh = replace(template, vertices=head.vertices, colors=head.colors, texture=head.texture)
     mesh = replace(mesh, uvs=painted.uvs, uv_faces=painted.uv_faces)
     note = "taken as it is, for its triangles are the template's (no scan to register)"
-    record = RegistrationRecord("its triangles", 0.0, (), (note,), 0.0, 1.0, 0.0, 0.0, 1.0, slid=0.0, bent=False)
+    record = RegistrationRecord("its triangles", 0.0, (), (note,), 0.0, 1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, bent=False)
     return Registration(mesh, pose, torch.zeros(len(head.vertices)).double(), known, record)
 
 
