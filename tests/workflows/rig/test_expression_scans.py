@@ -16,6 +16,7 @@ from torchface.workflows.rig.expression_scans import (
     expressions_in,
     neutral_in,
     seen_example,
+    shared_notes,
 )
 
 NAMES = ("jawOpen", "browInnerUp_L", "browInnerUp_R", "mouthSmile_L")
@@ -170,3 +171,14 @@ def test_it_is_the_optimum_of_its_cost(dome_rig: BlendshapeRig) -> None:
 def test_other_shapes_are_refused(dome_rig: BlendshapeRig) -> None:
     with pytest.raises(ShapeError, match="seen_example"):
         seen_example(dome_rig.neutral, dome_rig.vertices[:5], torch.ones(5, dtype=torch.bool))
+
+
+def test_what_every_example_shows_is_asked_of_the_neutral(tmp_path: Path) -> None:
+    touch(tmp_path, "jawOpen.obj", "jawOpen=0.5+browInnerUp.obj", "jawOpen=0.5+mouthSmileLeft.obj")
+    found = expressions_in(tmp_path, NAMES)
+    (note,) = shared_notes(found, torch.zeros(4), NAMES)
+    assert "--pose jawOpen=0.5 " in note
+    assert shared_notes(found, torch.tensor([0.5, 0, 0, 0]), NAMES) == []
+    assert shared_notes(found[:2], torch.zeros(4), NAMES) == []
+    touch(tmp_path, "browInnerUp.obj")
+    assert shared_notes(expressions_in(tmp_path, NAMES), torch.zeros(4), NAMES) == []

@@ -66,6 +66,7 @@ from torchface.workflows.rig.expression_scans import (
     expressions_in,
     neutral_in,
     seen_example,
+    shared_notes,
     weights_row,
 )
 from torchface.workflows.rig.shut_eyes import with_eye_note
@@ -168,6 +169,7 @@ def rig_actor(
             f"does the neutral; torchface rig --pose {seen} takes it out",
         )
     notes = (*registration.record.notes, *(f"warning: {note}" for note in doubts))
+    notes += tuple(shared_notes(expressions, shown, rig.names))
     registration = replace(registration, record=replace(registration.record, notes=notes))
     actor: BlendshapeRig = transferred.rig
     predicted = None if regression is None else neutral_rig(regression, rig, neutral)

@@ -26,6 +26,7 @@ LAYOUT = (
     "jawOpen.obj, jawOpen=0.6+mouthSmileLeft=0.5.obj"
 )
 
+_SEVERAL = 3
 # Millimetres between an expression and its mirror image where the two are distinguished at all.
 _TELLING = 1.0
 _LEAST_VERTICES = 20
@@ -82,6 +83,15 @@ def expressions_in(folder: Path, names: Sequence[str]) -> list[Expression]:
         if not expression.weights.any():
             raise ValueRangeError(f"{expression.path}: found no weight above 0 for it, expected an expression")
     return expressions
+
+
+def shared_notes(expressions: Sequence[Expression], shown: Tensor, names: Sequence[str]) -> list[str]:
+    """A note where all of several scans show more of a shape than the neutral is said to, weights (N,): so may it."""
+    if len(expressions) < _SEVERAL:
+        return []
+    least = torch.stack([expression.weights for expression in expressions]).amin(0)
+    shared = " ".join(f"{names[i]}={float(least[i]):g}" for i in (least > shown).nonzero()[:, 0].tolist())
+    return [f"every example shows {shared}; --pose {shared} where the neutral scan shows it, too"] if shared else []
 
 
 def neutral_in(folder: Path) -> Path | None:
