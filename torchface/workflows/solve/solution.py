@@ -78,6 +78,7 @@ class Solution:
     motion: HelmetMotion | None = None  # the helmet's, where it was asked for
     cleanup: Cleanup | None = None  # what was wrong with the take, where that was asked for
     warnings: tuple[str, ...] = ()  # what the user should know before they use the weights
+    exchanged: bool = False  # labels are, by a warning; what is subtracted at rest hides that in the distances
 
     @property
     def weights(self) -> Tensor:
@@ -157,6 +158,8 @@ class SolveReport:
         if fit.noisy:
             why = "more noise than a stage's, another head's rig, or a take that needs --clean or --slip?"
             return f"result: partly usable, {lie}; {why}); {seen}"
+        if self.solution.exchanged:
+            return f"result: partly usable, labels seem to be exchanged, see the warning; {lie}); {seen}"
         if self.solution.stray_warnings:
             return f"result: partly usable, single frames are wrong, see the warning; {lie}); {seen}"
         if self.seen < _MOST:
@@ -228,9 +231,9 @@ def solve_markers(
         warnings += neutral_warnings(rig, attachment, raw, settings.neutral, settings.free_scale)
 
     cleanup = None
-    if not settings.clean:
-        warnings += label_warnings(solver, take, settings.slip)
-    else:
+    exchanged = [] if settings.clean else label_warnings(solver, take, settings.slip)
+    warnings += exchanged
+    if settings.clean:
         progress("looking for what is wrong with the take")
         cleanup = clean_take(solver, take, settings.slip)
         if alignment is not None and any(defect.kind != "gap" for defect in cleanup.defects):
@@ -270,7 +273,7 @@ def solve_markers(
     sites = attachment.select(labels)
     if head is not None and motion is not None and alignment is not None:
         motion = head.moved_by(alignment).after(motion)
-    solution = Solution(rig, solved, markers, sites, alignment, motion, cleanup)
+    solution = Solution(rig, solved, markers, sites, alignment, motion, cleanup, exchanged=bool(exchanged))
     return replace(solution, warnings=(*warnings, *solution.stray_warnings))
 
 
