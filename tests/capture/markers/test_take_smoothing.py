@@ -91,6 +91,19 @@ def test_nothing_nearby_has_less_energy_whatever_is_hidden(
             assert whole.energy(markers, nearby) > least - 1e-3
 
 
+@pytest.mark.parametrize("dropped", [False, True])
+def test_weights_are_held_where_a_take_ends_without_markers(performance: Performance, dropped: bool) -> None:
+    rig, attachment, takes = performance
+    take = record(rig, attachment, takes[0][:60], torch.Generator().manual_seed(1), StageFlaws()).take
+    values = take.markers.values.clone()
+    values[:5], values[40:] = torch.nan, torch.nan
+    seconds = torch.arange(60) / 60 + 0.5 * (torch.arange(60) > 20) if dropped else None
+    found = WholeTakeSolver(MarkerSolver(rig, attachment))(values, 60.0, seconds)
+    assert torch.equal(found[:5], found[5].expand(5, -1))
+    assert torch.equal(found[40:], found[39].expand(20, -1))
+    assert not torch.equal(found[38], found[39])
+
+
 def test_a_blink_keeps_its_height(small_rig: BlendshapeRig, small_attachment: Attachment) -> None:
     seconds = torch.arange(180) / 60
     blink = torch.exp(-((seconds - 1.5) ** 2) / (2 * 0.04**2))

@@ -15,7 +15,7 @@ from torchface.errors import ValueRangeError
 from torchface.geometry.similarity import Similarity
 from torchface.synthetic.stages import StageFlaws, place_markers, record
 from torchface.workflows.marker_input import scale_warnings
-from torchface.workflows.solve.solution import _frames
+from torchface.workflows.solve.solution import _empty_frame_warnings, _frames
 from torchface.workflows.solve.take_check import check_coverage
 
 Solve = Callable[..., str]
@@ -209,6 +209,14 @@ def test_of_many_stretches_of_frames_the_first_are_named_and_the_others_counted(
     said = _frames(Take(60.0, markers=Track(("a",), torch.zeros(100, 1, 3))), rows)
     assert said.startswith("30 frames (0–2, 10–12, ")
     assert said.endswith("70–72 and 2 more stretches)")
+
+
+@pytest.mark.parametrize(("empty", "said"), [([4], "before and after"), ([4, 9], "held at the take's ends")])
+def test_of_a_take_that_ends_without_markers_is_said_what_is_held(empty: list[int], said: str) -> None:
+    markers = torch.zeros(10, 3, 3)
+    markers[empty] = torch.nan
+    (warning,) = _empty_frame_warnings(Take(60.0, markers=Track(("a", "b", "c"), markers)))
+    assert warning.endswith(said)
 
 
 @pytest.mark.parametrize("more", [(), ("--frame-by-frame",), ("--frame-by-frame", "--slip", "--clean")])

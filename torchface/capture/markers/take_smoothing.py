@@ -39,8 +39,8 @@ class WholeTakeSolver(nn.Module):
 
     with Huber's :math:`h_\tau(d) = d^2` for :math:`|d| \le \tau` and :math:`2\tau|d| - \tau^2` beyond it: slow motion
     is smoothed, a blink or a syllable passes. The first term counts all M markers, seen or not, so a frame that
-    shows few of them depends more on its neighbours, and one that shows none is interpolated. What a classifier
-    predicts pulls as in :class:`HybridSolver`.
+    shows few of them depends more on its neighbours, and one that shows none is interpolated, at the take's ends
+    held. What a classifier predicts pulls as in :class:`HybridSolver`, also in frames at the ends that show none.
 
     Args:
         markers: rig, attachment, alignment and ridge; its sparsity is for single frames, see ``sparsity``.
@@ -135,11 +135,14 @@ class WholeTakeSolver(nn.Module):
             raise ShapeError(f"markers: found {tuple(markers.shape)}, expected (T,{len(self.markers.rest)},3)")
         if torch.isinf(markers).any():
             raise ValueRangeError("markers: found infinite coordinates, expected millimetres, or NaN for not seen")
-        if not len(markers) or bool(torch.isnan(markers).any(-1).all()):
-            raise ValueRangeError(f"markers: found none in any of {len(markers)} frames, expected some")
+        shown = frames_seen(markers)
+        begin, end = int(shown[0]), int(shown[-1]) + 1
         solve = self._solve if self.markers.activation is None else self._solve_corrected
         with torch.no_grad():
             pull = self._pull(len(markers), predicted, gamma)
+            if pull is None and end - begin < len(markers):  # beyond them, smooth curves would run on
+                held = self(markers[begin:end], fps, None if seconds is None else seconds[begin:end])
+                return interpolated(held, torch.arange(begin, end, device=held.device), len(markers))
             if seconds is None or len(markers) < 2:
                 return solve(markers.double(), *self._scaled(fps), pull).to(markers.dtype)
             rate, rows = frame_grid(seconds, fps)

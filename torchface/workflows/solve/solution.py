@@ -226,7 +226,7 @@ def solve_markers(
     fit = check_explained(solver, take, alignment is not None, settings.slip, settings.insist)
     doubts = fit_warnings(fit, alignment is not None, settings.slip)
     warnings += doubts
-    warnings += _empty_frame_warnings(take)
+    warnings += _empty_frame_warnings(take, predicted is None)
     if settings.neutral is not None:
         warnings += neutral_warnings(rig, attachment, raw, settings.neutral, settings.free_scale)
 
@@ -294,12 +294,13 @@ def _without_slip(
     return _moved(take, motion.undo), motion
 
 
-def _empty_frame_warnings(take: Take) -> list[str]:
+def _empty_frame_warnings(take: Take, held: bool = True) -> list[str]:
     """Which frames show no marker; nothing where all show some."""
     empty = empty_frames(take)
     if not len(empty):
         return []
-    return [f"{_frames(take, empty)} show no marker; their weights come from the frames before and after"]
+    ends = ", held at the take's ends" if held and not {0, len(take) - 1}.isdisjoint(empty.tolist()) else ""
+    return [f"{_frames(take, empty)} show no marker; their weights come from the frames before and after{ends}"]
 
 
 def _frames(take: Take, rows: Tensor) -> str:
