@@ -2,6 +2,7 @@
 
 import errno
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -188,6 +189,37 @@ def test_pairs_lay_another_topology_on_the_model(actor: Actor, tmp_path: Path, e
     error = found.read(0, FRAMES) - actor.frames
     assert float(error.norm(dim=-1).mean()) < 0.1
     assert "pairs of pairs" in " ".join(found.notes)
+
+
+def test_a_first_frame_that_is_not_at_rest_is_named_with_one_that_is(actor: Actor, tmp_path: Path) -> None:
+    order, faces = shuffled(actor)
+    pairs = tmp_path / "pairs.csv"
+    pairs.write_text("\n".join(["input,model", *(f"{i},{order[i]}" for i in range(0, len(order), 9))]))
+    said = []
+    for name, frames in (("rest", actor.frames), ("moved", actor.frames.flip(0))):
+        path = written(tmp_path / f"{name}.safetensors", frames[:, order], faces)
+        said.append(" ".join(coarse(actor, path, tmp_path, pairs=pairs).notes))
+    words = r"warning: moved.safetensors is taken to be at rest in its first frame, \d\.\d mm from the model's head"
+    assert re.search(words + rf" at rest, but frame {FRAMES - 1} is \d\.\d mm from it: .*\(--rig\)", said[1])
+    assert "warning" not in said[0]
+
+
+@pytest.mark.parametrize("other", [False, True])
+def test_a_vertex_that_is_astray_in_one_frame_is_named(actor: Actor, tmp_path: Path, other: bool) -> None:
+    order, faces = shuffled(actor)
+    frames = actor.frames.clone()
+    frames[7, order[300], 1] += 866.0
+    pairs = tmp_path / "pairs.csv"
+    pairs.write_text("\n".join(["input,model", *(f"{i},{order[i]}" for i in range(0, len(order), 9))]))
+    path = tmp_path / "astray.safetensors"
+    if other:
+        found = coarse(actor, written(path, frames[:, order], faces), tmp_path, pairs=pairs)
+    else:
+        found = coarse(actor, written(path, frames, actor.mesh.faces), tmp_path)
+    assert torch.isfinite(found.read(0, 7)).all()
+    vertex = 300 if other else int(order[300])
+    with pytest.raises(ValueRangeError, match=rf"vertex {vertex} in frame 7 86\d mm farther .* \(1 of {len(order)}"):
+        found.read(4, FRAMES)
 
 
 def test_registration_is_asked_once(actor: Actor, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -19,6 +19,7 @@ OWN_HEAD_MM = 1.0
 """From how far on an input's face at rest is its own head: without it, at 1.3 mm, the model added 0.22 mm to another
 person's smooth frames (root mean square), with it 0.13 as to the actor's."""
 SAMPLED = 24  # frames of an animation, in which one at rest is looked for
+_ASTRAY_MM = 100.0
 _UNITS = ((1000.0, "metres"), (10.0, "centimetres"), (25.4, "inches"), (0.001, "micrometres"))
 
 
@@ -56,6 +57,7 @@ def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> Coa
     def read(begin: int, end: int) -> Tensor:
         vertices = animated.read(begin, end).float()
         check_finite(vertices, animated.path, 1, begin)
+        check_astray(vertices, model, animated.path, begin)
         return vertices
 
     another = animated.rig is not None and residual > OWN_HEAD_MM
@@ -77,10 +79,15 @@ def same_topology(animated: AnimatedMesh, model: Mesh, fps: float | None) -> Coa
 
 def distance_at_rest(frames: Tensor, rest: Tensor, path: Path) -> float:
     """Root mean square distance from a face at rest (V,3) of the frame (t,V,3) nearest to it, all aligned with it."""
+    check_scale(float((_size(rest[None]) / _size(frames).clamp(min=1e-9)).median()), path)
+    return float(distances_at_rest(frames, rest).min())
+
+
+def distances_at_rest(frames: Tensor, rest: Tensor) -> Tensor:
+    """Root mean square distance of each frame (t,V,3), aligned with it, from a face at rest (V,3); (t,)."""
     target = rest.expand_as(frames)
-    check_scale(float((_size(target) / _size(frames).clamp(min=1e-9)).median()), path)
     aligned = similarity_transform(frames, target).apply(frames)
-    return float((aligned - target).square().sum(-1).mean(-1).sqrt().min())
+    return (aligned - target).square().sum(-1).mean(-1).sqrt()
 
 
 def _size(vertices: Tensor) -> Tensor:
@@ -112,6 +119,31 @@ def check_finite(vertices: Tensor, path: Path, step: int, begin: int = 0) -> Non
             f"{path}: found all vertices of frame {begin + int(empty[0]) * step} in one place, expected a head; leave "
             "such frames out, or repair them first"
         )
+
+
+def check_astray(vertices: Tensor, rest: Mesh, path: Path, begin: int) -> None:
+    """Raises ``ValueRangeError`` where the distance of a vertex from its neighbours in vertices (t,N,3), the frames
+    from ``begin`` on, is another than at rest by more than 100 mm."""
+    usual = _apart(rest.vertices, rest.faces)
+    for frame, found in enumerate(vertices):
+        more = _apart(found, rest.faces) - usual
+        far = more.abs() > _ASTRAY_MM
+        if far.any():
+            worst = int(more.abs().argmax())
+            way = float(more.flatten()[worst])
+            raise ValueRangeError(
+                f"{path}: found vertex {int(rest.faces.flatten()[worst])} in frame {begin + frame} {abs(way):.0f} mm "
+                f"{'farther from' if way > 0 else 'nearer to'} its neighbours than at rest "
+                f"({len(rest.faces[far].unique())} of {len(found)} vertices are), expected at most {_ASTRAY_MM:g}; "
+                "leave such frames out, or repair them first"
+            )
+
+
+def _apart(vertices: Tensor, faces: Tensor) -> Tensor:
+    """How far each corner of the triangles (F,3) is from the nearer of the other two, (F,3)."""
+    corners = vertices[faces]
+    sides = (corners - corners.roll(1, 1)).norm(dim=-1)
+    return torch.minimum(sides, sides.roll(-1, 1))
 
 
 def check_scale(scale: float, path: Path) -> None:
