@@ -10,6 +10,7 @@ from torchface import Attachment, Take, Track, save_take
 from torchface.errors import AlignmentError, NameMismatchError, ShapeError, TopologyError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import similarity_transform
+from torchface.synthetic.stages import place_markers
 
 
 @pytest.mark.parametrize("freely", [False, True])
@@ -96,3 +97,18 @@ def test_a_marker_that_is_astray_in_one_frame_counts_as_not_seen_there(actor: Ac
     assert float((found.read(7, 8) - actor.frames[7]).norm(dim=-1).max()) < 5
     assert torch.equal(found.read(10, 11), found.read(9, 10))
     assert any("and held at the take's ends" in line for line in found.notes)
+
+
+def test_frames_that_lack_markers_without_those_astray_are_interpolated_and_from_others_alone(
+    actor: Actor, tmp_path: Path
+) -> None:
+    sites = place_markers(actor.rig, 12)
+    sites.save(tmp_path / "sites.json")
+    points = sites.on(actor.mesh.faces, actor.frames)
+    points[7, 3] += 500.0
+    points[2:7] = torch.nan
+    save_take(Take(FPS, markers=Track(sites.labels or (), points)), tmp_path / "take.trc")
+    found = coarse(actor, tmp_path / "take.trc", tmp_path, attachment=tmp_path / "sites.json")
+    assert any("left out: 1, at worst M004 in frame 7 by 86" in line for line in found.notes)
+    assert any("6 of 12 frames (the first 2) show fewer than 12 markers" in line for line in found.notes)
+    assert float((found.read(0, FRAMES) - actor.frames).norm(dim=-1).max()) < 10

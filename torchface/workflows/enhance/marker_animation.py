@@ -101,9 +101,10 @@ def marker_animation(
     shell = ThinShell(model.vertices, model.faces, attachment)
     pose = _pose(path, take, sites, shell, neutral)
     check_scale(float(pose.scale[0]), path)
-    markers, gap_notes = _without_gaps(placed(pose, take.markers.values), path)
+    samples = placed(pose, take.markers.values)
     if attachment.residual is not None:
-        markers = markers - attachment.residual.to(markers)
+        samples = samples - attachment.residual.to(samples)
+    markers, gap_notes = _without_gaps(samples, path)
     rest = shell.rest
     away = _from_sites(rest, markers)
     offsets = float(away.square().sum(-1).nanmean(-1).sqrt().quantile(0.05))
@@ -115,14 +116,15 @@ def marker_animation(
             f"expected at most {_MOST_AT_REST_MM:g}; "
             + ("; ".join(exchanged) or "the attachment or the rig is another one's, or labels are mixed up")
         )
-    astray = away.norm(dim=-1) > _ASTRAY_MM  # not of what is NaN
+    off = away.norm(dim=-1).where(torch.isfinite(samples).all(-1), 0.0)
+    astray = off > _ASTRAY_MM
     if astray.any():
-        frame, marker = divmod(int(away.norm(dim=-1).nan_to_num(0.0).argmax()), len(labels))
+        frame, marker = divmod(int(off.argmax()), len(labels))
+        markers, gap_notes = _without_gaps(samples.masked_fill(astray[..., None], torch.nan), path)
         gap_notes.append(
-            f"warning: {int(astray.sum())} samples lie more than {_ASTRAY_MM:g} mm from their sites, at worst "
-            f"{labels[marker]} in frame {frame} by {float(away[frame, marker].norm()):.0f} mm; they are left out"
+            f"warning: samples more than {_ASTRAY_MM:g} mm from their sites are left out: {int(astray.sum())}, at "
+            f"worst {labels[marker]} in frame {frame} by {float(off.max()):.0f} mm"
         )
-        markers = markers.masked_fill(astray[..., None], torch.nan)
     if neutral is not None:
         seen = markers[neutral]
         still = rigid_motion(rest.double(), seen[None].double()).inverse().apply(seen[None].double())[0].float()
