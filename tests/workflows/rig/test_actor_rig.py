@@ -183,6 +183,21 @@ def test_a_head_with_the_templates_triangles_is_not_registered(actor: Actor, tmp
     torch.testing.assert_close(made.deltas, truth.deltas, atol=1e-2, rtol=0)
 
 
+def test_what_every_example_shows_is_asked_of_the_neutral_scan(actor: Actor, tmp_path: Path) -> None:
+    """Three that open the jaw and a neutral at rest: a question, which does not make the result worse."""
+    head, examples, names = actor.true, tmp_path / "examples", actor.true.names
+    examples.mkdir()
+    save_mesh(head.neutral, tmp_path / "head.obj")
+    for other in names[1:]:
+        weights = torch.tensor([0.5 * (name == names[0]) + (name == other) for name in names])
+        shown = head.neutral.with_vertices(head(weights[None])[0])
+        save_mesh(shown, examples / f"{names[0]}=0.5+{other}.obj")
+        report = rig_actor(tmp_path / "head.obj", actor.folder / "template.glb", tmp_path / "r.glb", examples=examples)
+        asked = [line for line in report.lines() if f"every example shows {names[0]}=0.5; --pose" in line]
+        assert len(asked) == (other == names[3])  # of one or two it is not asked
+        assert report.lines()[0].startswith("result: good")
+
+
 def test_bad_examples_are_skipped_and_none_that_serves_ends_it(actor: Actor, tmp_path: Path) -> None:
     (tmp_path / "mouthSmileLeft.ply").write_bytes(b"junk")
     files = (actor.folder / "neutral.ply", actor.folder / "template.glb", tmp_path / "a.glb")
