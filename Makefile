@@ -21,12 +21,12 @@ $(STAMP): $(VENV)/.made pyproject.toml constraints.txt
 	$(INSTALL) .
 	touch $@
 
-# What tests import is compiled once, before several processes do it at the same time.
+# Each has what tests need, too. What tests import is compiled once, before several processes do it at the same time.
 $(VENV)/.installed-%: $(VENV)/.made pyproject.toml constraints.txt
 	@echo "installing torchface and what '$*' needs into $(VENV), a few minutes"
 	$(INSTALL) '.[test,$*]'
 	PYTHONDONTWRITEBYTECODE= $(RUN) -c 'import matplotlib.pyplot, onnxscript.optimizer, sklearn.svm, torch._dynamo, torch.onnx, trimesh'
-	touch $(STAMP) $@
+	touch $(STAMP) $(VENV)/.installed-test $@
 
 # Three processes of one thread each for two cores, as browsers and programs are waited for; the longest files first, and what is
 # costly to make once (a synthetic video, a browser) stays in one.
