@@ -19,7 +19,7 @@ from torchface import Attachment, BlendshapeRig, __version__
 from torchface.capture import HybridSolver, MarkerSolver
 from torchface.errors import ValueRangeError
 from torchface.onnx import GraphSteps, SolverReport, export_model, export_solver, solver_graph_export
-from torchface.onnx.solver_graph_export import hide_markers, random_frames, solver_graph
+from torchface.onnx.solver_graph_export import SolverGap, hide_markers, random_frames, solver_graph
 from torchface.synthetic.stages import place_markers
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "examples" / "solve_onnx.py"
@@ -45,6 +45,13 @@ def written(turned_bumps: MarkerSolver, tmp_path_factory: pytest.TempPathFactory
     report = export_model(turned_bumps, tmp_path_factory.mktemp("graph") / "solver.onnx", {"data": "planted"})
     assert isinstance(report, SolverReport)
     return report
+
+
+@pytest.mark.parametrize(("apart", "usual"), [(1.9e-6, True), (2e-5, False)])
+def test_words_say_what_rounding_makes_and_how_much_more_is_usual(apart: float, usual: bool) -> None:
+    words = SolverGap(0.0, 0.0, 0.0, 0.0, parity=apart, rounding=1.1e-6).runtime()
+    assert f"{apart:.1e}; rounding alone makes 1.1e-06" in words
+    assert words.endswith(", up to 10 times as much is usual") == usual
 
 
 def test_the_file_is_the_graph(written: SolverReport, turned_bumps: MarkerSolver) -> None:

@@ -59,10 +59,11 @@ class SolverGap:
 
     def runtime(self) -> str:
         """How far ONNX Runtime is from PyTorch, in words."""
-        found = f"ONNX Runtime's weights differ from PyTorch's by {self.parity:.1e}"
-        if self.parity <= _ROUNDINGS * self.rounding:
-            return f"{found}, as rounding explains ({self.rounding:.1e})"
-        return f"{found} (rounding alone: {self.rounding:.1e})"
+        usual = f", up to {_ROUNDINGS:.0f} times as much is usual" if self.parity <= _ROUNDINGS * self.rounding else ""
+        return (
+            f"ONNX Runtime's weights differ from PyTorch's by {self.parity:.1e}; "
+            f"rounding alone makes {self.rounding:.1e}{usual}"
+        )
 
 
 @dataclass(frozen=True)
