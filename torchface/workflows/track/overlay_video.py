@@ -45,7 +45,8 @@ def side_by_side_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
     """Draws frame number t of a video, uint8 (3,H,W), as uint8 (3,h,2w): the picture left, the rig right.
 
     Both are cut to where the head is in the whole take. Landmarks are green in the picture, orange where their
-    confidence is low; what of the rig lies there is tinted orange. A frame without a face shows no rig.
+    confidence is low, left out where they are taken for hidden; what of the rig lies at the last two is tinted orange.
+    A frame without a face shows no rig.
     """
     window = head_window(tracked)
     rig, weights = tracked.shown, tracked.solution.weights.detach()

@@ -32,7 +32,7 @@ def write_track_page(tracked: Tracked, out: Path) -> Path:
         Section(
             "Frames",
             "The picture and, beside it, the solved rig in the same pose; landmarks are green, those of low confidence "
-            "and what of the rig lies there orange.",
+            "orange, those taken for hidden are left out; what of the rig lies at either is orange.",
             [_suspect(tracked)],
             [("frames.png", beside)],
             _player(tracked),
