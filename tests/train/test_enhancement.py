@@ -127,7 +127,7 @@ def test_another_persons_sequences_are_warned_of(folder, monkeypatch):
     with pytest.warns(UserWarning, match=r"1 of 4 sequences come .* b\.npz [2-9]\.\d mm .*another person"):
         train(settings(folder))
     another("z.npz", 0.001)
-    with pytest.raises(AlignmentError, match=r"z\.npz: found a head .* it seems to be in metres"):
+    with pytest.raises(AlignmentError, match=r"z\.npz: found a head .* in metres .* scale the files to millimetres\)"):
         train(settings(folder))
 
 

@@ -155,7 +155,8 @@ def check_scale(scale: float, path: Path) -> None:
     why = f"it seems to be in {unit}" if unit else "its unit is another one, or it is no head of this model"
     raise AlignmentError(
         f"{path}: found a head {size} for the model, expected millimetres and a factor of {MIN_HEAD_SCALE} to "
-        f"{MAX_HEAD_SCALE}; {why} (--unit for markers and meshes)"
+        f"{MAX_HEAD_SCALE}; {why} (--unit of markers and meshes where the command has it, "
+        "else scale the files to millimetres)"
     )
 
 
