@@ -60,7 +60,7 @@ class Settings(RecipeSettings):
             the model, so that `torchface fit` needs no other. The first mesh where absent, set upright by its landmarks
             if it has any.
         part: The region of template or `FaceXModel` that the heads have, such as face.
-        unit: Of the scans' files (mm, cm, m) where it is not the format's own; of the template's if it is no rig.
+        unit: Of the scans' files (um, mm, cm, m, in) where it is not the format's own; of the template's if no rig.
         held_out: How many meshes, the last by name, are kept for the test; or how many more performers are drawn for
             it. If absent 20 performers, a tenth of 100 meshes and more; of fewer meshes each is left out once.
         components: How many components of shape; all if absent, at most 200.

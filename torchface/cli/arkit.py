@@ -50,7 +50,7 @@ def arkit(
         temporal: Solve all frames of an animation together, smooth in time; --no-temporal solves each by itself.
         fps: Frames a second of an animation; as its file says, or 30, if absent. Of weights by name where their file
             has neither times nor a rate.
-        unit: Unit of SOURCE's file (mm, cm, m) where it is not the format's own.
+        unit: Unit of SOURCE's file (um, mm, cm, m, in) where it is not the format's own.
     """
     from torchface.errors import ValueRangeError
     from torchface.files.job_lock import file_lock

@@ -30,7 +30,7 @@ def convert(
             (.obj, .ply, .stl, .off).
         out: .glb, .usda, .usdc, .usd, .usdz, .ma (Maya), .fbx, .blend, or a name without an ending for a folder of OBJ
             files; a mesh without shapes, or in a pose, also as .obj, .ply, .stl, .off. May be given as --out OUT.
-        unit: Unit of FILE (mm, cm, m) where it is not the format's own.
+        unit: Unit of FILE (um, mm, cm, m, in) where it is not the format's own.
         part: Keep this region only, such as face.
         names: Names of the written shapes. "arkit": ARKit's where the rig's mean the same. All keep theirs if absent.
         at: Write the mesh in this pose, such as mouthSmileLeft=1 jawOpen=0.7, instead of the rig.

@@ -33,7 +33,7 @@ def corrective(
             USD). `torchface convert RIG POSED.obj --at ...` writes the mesh to begin from.
         out: The rig to write: .glb, USD, .ma, .blend, or a name without an ending for a folder of OBJ files.
         name: Name of the corrective; the names of its shapes if absent.
-        unit: Unit of the sculpt (mm, cm, m) where it is not the format's own.
+        unit: Unit of the sculpt (um, mm, cm, m, in) where it is not the format's own.
         align: A sculpt of which the whole mesh has moved is refused; "remove" takes that motion out, "keep" takes it as
             part of the sculpt.
         replace: Take the place of a corrective that RIG has at this pose.

@@ -69,8 +69,7 @@ def enhance(
         neutral: A frame of the markers with the face at rest; motion counts from it. From the sites if absent.
         fps: Frames a second of meshes; 30 if absent.
         labels: What the take's labels are called in the attachment; see `torchface solve`.
-        unit: What the coordinates of markers or meshes are in; if absent what the file says, else millimetres. Meshes:
-            mm, cm or m.
+        unit: What the coordinates of markers or meshes are in; if absent what the file says, else millimetres.
         flip: Negate this axis of the markers' coordinates.
         meshes: Also write every frame as a mesh file of this kind.
         textures: A mesh of the model's topology with texture coordinates, such as the captured neutral: colours that

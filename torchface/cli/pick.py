@@ -40,7 +40,7 @@ def pick(
         mode: What to pick first; the page can change it.
         landmarks: iBUG's 68, or the twelve of eyes, nose, cheeks and mouth.
         names: Names of landmarks of your own instead; "left" and "right" in a name are mirror images.
-        unit: Unit of the mesh (mm, cm, m) where it is not the format's own.
+        unit: Unit of the mesh (um, mm, cm, m, in) where it is not the format's own.
         scan_unit: Unit of the scan.
         part: Keep this region only, such as face.
         port: The first port to try.

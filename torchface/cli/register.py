@@ -43,7 +43,7 @@ def register(
         landmarks: Folder of landmark files named as the scans are, or the file of the only scan: .ljson, .pts or .json
             in the order of the template's annotated landmarks, or correspondences saved by `torchface pick`.
         part: Keep this region of the template only, such as face.
-        unit: Unit of the scans (mm, cm, m) where it is not the format's own.
+        unit: Unit of the scans (um, mm, cm, m, in) where it is not the format's own.
         detector: Landmark detector for scans without landmarks, by name or folder; `uv_landmarks` has learned from
             coloured scans with closed eyes. Without it the face is found by its shape.
         texture_size: Texels a side of each result's texture; 0 makes none.

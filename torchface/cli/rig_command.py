@@ -89,7 +89,7 @@ def rig(
         pose: What the neutral scan shows where it is not at rest, such as eyeBlinkLeft=1 eyeBlinkRight=1 for closed
             eyes; the rig's neutral has them open.
         part: Keep this region of the template only, such as face.
-        unit: Unit of all scans (mm, cm, m) where it is not the format's own.
+        unit: Unit of all scans (um, mm, cm, m, in) where it is not the format's own.
         detector: Landmark detector for scans without landmarks, by name or folder; `uv_landmarks` has learned from
             coloured scans with closed eyes. Without it the face is found by its shape.
         model: Model of heads in the template's topology, by name or folder, from which the neutral's registration

@@ -29,7 +29,7 @@ def transfer(
         out: The .glb or USD file to write, or a name without an ending for a folder of OBJ files in the template's
             vertex order.
         part: Keep this region of the template only, such as face; the neutral then has this part's topology.
-        unit: Unit of the neutral's file (mm, cm, m) where it is not the format's own.
+        unit: Unit of the neutral's file (um, mm, cm, m, in) where it is not the format's own.
         names: Names of the written shapes. "arkit": ARKit's where the template's mean the same, halves of one of its
             shapes merged (browInnerUp, cheekPuff); shapes that ARKit lacks keep theirs. All keep theirs if absent.
     """

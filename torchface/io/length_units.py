@@ -9,14 +9,15 @@ from torch import Tensor
 
 from torchface.errors import FileFormatError, ValueRangeError
 
-_MILLIMETRES = {"mm": 1.0, "cm": 10.0, "m": 1000.0}
+UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "um": 0.001}
+"""Millimetres in each unit that files are written in."""
 
 
 def millimetres_per(unit: str) -> float:
-    """How many millimetres a file's unit has: ``"mm"``, ``"cm"`` or ``"m"``."""
-    if unit not in _MILLIMETRES:
-        raise ValueRangeError(f"unit: found {unit!r}, expected one of {', '.join(map(repr, _MILLIMETRES))}")
-    return _MILLIMETRES[unit]
+    """How many millimetres a file's unit has: one of ``UNITS``."""
+    if unit not in UNITS:
+        raise ValueRangeError(f"unit: found {unit!r}, expected one of {', '.join(map(repr, UNITS))}")
+    return UNITS[unit]
 
 
 def finite_vertices(path: Path, values: NDArray[np.float64]) -> Tensor:

@@ -31,8 +31,8 @@ def load_mesh(path: str | Path, unit: str | None = None) -> Mesh:
             ``.stl`` (triangles, equal corners merged), ``.off`` (triangles), ``.glb``, ``.gltf`` or ``.vrm`` (the whole
             scene, morph targets at rest), ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` (the same). Vertices keep the
             file's order.
-        unit: the file's, ``"mm"``, ``"cm"`` or ``"m"``; if absent metres for glTF, what the file says for USD,
-            millimetres for the others.
+        unit: the file's, ``"um"``, ``"mm"``, ``"cm"``, ``"m"`` or ``"in"``; if absent metres for glTF, what
+            the file says for USD, millimetres for the others.
 
     Raises:
         FileFormatError: the file is missing, broken, or of another kind.

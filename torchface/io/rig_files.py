@@ -42,8 +42,8 @@ def load_rig(
         path: a ``.glb``, ``.gltf`` or ``.vrm`` with morph targets; a ``.usd``, ``.usda``, ``.usdc`` or ``.usdz`` with
             blend shapes; ICT-FaceKit's ``FaceXModel`` folder; or a folder of OBJ files, one of them neutral, every
             other a shape of its file's name.
-        unit: ``"mm"``, ``"cm"`` or ``"m"``; if absent metres for glTF, what the file says for USD, centimetres for
-            ICT, millimetres for OBJ.
+        unit: ``"um"``, ``"mm"``, ``"cm"``, ``"m"`` or ``"in"``; if absent metres for glTF, what the file says for
+            USD, centimetres for ICT, millimetres for OBJ.
         part: keep this annotated region only, such as ``"face"`` of an ICT head.
         shapes: keep these, in this order; all (for ICT the 53 expressions) if absent.
         neutral: the name of the neutral's file in an OBJ folder; if absent the one with "neutral" in it.

@@ -71,7 +71,7 @@ def load_scan_landmarks(path: str | Path, template: Mesh, scan: str | Path, unit
         raise ShapeError(f"{path}: found {len(points)} points, expected the template's {len(ids)} landmarks")
     suffix = Path(scan).suffix.lower()
     if unit is None and suffix in USD_ENDINGS:
-        raise ValueRangeError(f"{path}: found points beside a USD file, expected their unit (mm, cm or m; --unit)")
+        raise ValueRangeError(f"{path}: found points beside a USD file, expected their unit (mm, cm, m, in; --unit)")
     per_unit = millimetres_per(unit or ("m" if suffix in GLTF_ENDINGS else "mm"))
     return ids, points * torch.tensor(per_unit, dtype=points.dtype)
 

@@ -18,7 +18,7 @@ BOX = torch.tensor([[0.0, 0.0, 0.0], [120.0, 160.0, 150.0]])  # its diagonal is 
     [
         (1e-3, r"in metres \(load with unit='m'; on the command line --unit m\)"),
         (0.1, r"in centimetres \(load with unit='cm'; on the command line --unit cm\)"),
-        (1 / 25.4, r"in inches \(scale them by 25.4\)"),
+        (1 / 25.4, r"in inches \(load with unit='in'; on the command line --unit in\)"),
         (10.0, r"in millimetres and were read as centimetres \(leave the unit out\)"),
         (1e3, r"in millimetres and were read as metres \(leave the unit out, or say --unit mm\)"),
         (1e5, r"of 250 mm; expected both in millimetres"),

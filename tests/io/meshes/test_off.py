@@ -40,6 +40,9 @@ def test_polygons_and_units_of_an_off(tmp_path: Path) -> None:
     (tmp_path / "a.off").write_text(CUBE_CORNER)
     mesh = load_mesh(tmp_path / "a.off", unit="cm")
     assert mesh.vertices[5].tolist() == [10, 0, 10]
+    inches, micrometres = (load_mesh(tmp_path / "a.off", unit=unit).vertices[5] for unit in ("in", "um"))
+    torch.testing.assert_close(inches, torch.tensor([25.4, 0, 25.4]))
+    torch.testing.assert_close(micrometres, torch.tensor([0.001, 0, 0.001]))
     a, b, c = mesh.vertices[mesh.faces].unbind(1)
     assert float(torch.linalg.cross(b - a, c - a).norm(dim=1).sum()) == pytest.approx(600)  # three squares, twice
     (tmp_path / "b.off").write_text(CUBE_CORNER.replace("OFF # three squares\n", "COFF "))

@@ -11,6 +11,7 @@ from torchface.capture.markers.helmet_motion import HelmetMotion, free_motion
 from torchface.capture.markers.rest_pose import pose_of_take, solve_weights
 from torchface.geometry.mirrored_points import check_mirrored
 from torchface.geometry.similarity import Similarity
+from torchface.io.length_units import UNITS
 
 # Shares of the sites' mean distance from their centre, 45 to 70 mm on a head. On real takes the markers of a rig that
 # fits stay within 0.009 with noise of 0.3 mm and 0.03 with 1 mm, swaps and gaps included; those of another head's rig,
@@ -23,7 +24,6 @@ TRIED_SHARE, DOUBTFUL_SHARE, REFUSED_SHARE = 0.015, 0.035, 0.1
 _MIN_RADIUS = 40.0
 # A correction names the cause if it leaves less than this part of the distance.
 _CORRECTED = 0.5
-_UNITS = {"m": 1000.0, "in": 25.4, "cm": 10.0, "mm": 1.0, "um": 0.001}
 _UNIT_TOLERANCE = 1.25
 # Beyond this no helmet slips: half the radius of the sites, or half a radian.
 _MAX_SLIP, _MAX_SLIP_ANGLE = 0.5, 0.5
@@ -187,9 +187,9 @@ def unit_of_scale(scale: float, read_as: str | None = None) -> str:
     be millimetres; empty where it is none's, or the one they were read in. Of unknown ones those too small were read
     as millimetres, and those too large are."""
     if read_as is None:
-        read_as = "mm" if scale > 1 else next((name for name in _UNITS if _near(scale * _UNITS[name], 1.0)), "mm")
-    size = scale * _UNITS[read_as]
-    return next((name for name, known in _UNITS.items() if name != read_as and _near(size, known)), "")
+        read_as = "mm" if scale > 1 else next((name for name in UNITS if _near(scale * UNITS[name], 1.0)), "mm")
+    size = scale * UNITS[read_as]
+    return next((name for name, known in UNITS.items() if name != read_as and _near(size, known)), "")
 
 
 def _near(size: float, other: float) -> bool:

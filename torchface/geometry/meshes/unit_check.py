@@ -11,7 +11,7 @@ _LOAD = "load with unit={0!r}; on the command line --unit {0}"
 _UNITS = {
     1e-3: ("in metres", _LOAD.format("m")),
     0.1: ("in centimetres", _LOAD.format("cm")),
-    1 / 25.4: ("in inches", "scale them by 25.4"),
+    1 / 25.4: ("in inches", _LOAD.format("in")),
     10.0: ("in millimetres and were read as centimetres", "leave the unit out"),
     1e3: ("in millimetres and were read as metres", "leave the unit out, or say --unit mm"),
 }

@@ -8,12 +8,10 @@ import numpy as np
 import torch
 
 from torchface.errors import FileFormatError, ValueRangeError
+from torchface.io.length_units import UNITS
 from torchface.io.tables.csv_table import quoted
 from torchface.io.tables.frame_rates import FrameTimes
 from torchface.take import Take, Track
-
-UNITS = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "in": 25.4, "um": 0.001}
-"""Millimetres in each unit that marker files are written in."""
 
 _SPELLINGS = {
     **dict.fromkeys(("millimeter", "millimeters", "millimetre", "millimetres"), "mm"),

@@ -24,8 +24,8 @@ _MAX_MATERIALS = 2**20  # bytes, of all material files of a mesh
 def read_obj(path: str | Path, unit: str = "mm") -> Mesh:
     """The mesh in an OBJ file: polygons, texture coordinates with seams, vertex colours, the material's image.
 
-    The material library and image are looked for beside the file, never outside its folder. Its unit is ``"mm"``,
-    ``"cm"`` or ``"m"``.
+    The material library and image are looked for beside the file, never outside its folder. Its unit is ``"um"``,
+    ``"mm"``, ``"cm"``, ``"m"`` or ``"in"``.
     """
     path, scale = Path(path), millimetres_per(unit)
     statements = read_statements(path, read_file(path))
