@@ -63,7 +63,7 @@ def annotated_landmarks(path: Path) -> list[tuple[Path, Tensor]]:
             if face.points.shape == (68, 2) and bool(torch.isfinite(face.points).all()):
                 found.append((_beside(path, face.image), face.points))
     elif path.is_dir():
-        for file in sorted(path.rglob("*.pts")):
+        for file in sorted(path.rglob("[!.]*.pts")):  # not hidden files, as macOS leaves
             pictures = [file.with_suffix(ending) for ending in IMAGE_ENDINGS if file.with_suffix(ending).is_file()]
             if not pictures:
                 raise FileFormatError(

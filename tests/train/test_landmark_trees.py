@@ -71,6 +71,7 @@ def test_large_pictures_are_made_smaller_with_their_landmarks(folder: Path, tmp_
     save_rendered_image(image, tmp_path / "large.png")
     rows = "\n".join(f"{x + 1} {y + 1}" for x, y in points.tolist())
     (tmp_path / "large.pts").write_text(f"version: 1\nn_points: 68\n{{\n{rows}\n}}\n")
+    (tmp_path / "._hidden.pts").write_bytes(b"\0\5\x16\7Mac OS X")
     faces = load_faces(tmp_path)
     assert 239 < float(faces.boxes[0, 2]) < 241
     white = faces.images[0].flatten().argmax()

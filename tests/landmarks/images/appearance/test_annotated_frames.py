@@ -95,6 +95,7 @@ def test_annotated_frames_come_back_from_their_folder(tmp_path: Path) -> None:
     ]
     for frame in frames:
         save_annotated_frame(frame, tmp_path / "new")
+    (tmp_path / "new" / "._hidden.pts").write_bytes(b"\0\5\x16\7Mac OS X")
     again = load_annotated_frames(tmp_path / "new")
     assert [frame.name for frame in again] == ["a", "b"]
     torch.testing.assert_close(again[1].landmarks, frames[0].landmarks, atol=1e-3, rtol=0)

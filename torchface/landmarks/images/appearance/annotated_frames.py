@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from torchface.errors import FileFormatError, ShapeError, ValueRangeError
-from torchface.files.whole_files import all_or_none, made_folder
+from torchface.files.whole_files import all_or_none, made_folder, visible_files
 from torchface.io.images.image_files import IMAGE_ENDINGS, load_image, save_image
 from torchface.io.landmarks.landmark_points import load_landmark_points, save_pts
 from torchface.landmarks.images.appearance.shape_modes import procrustes_mean
@@ -28,7 +28,7 @@ def load_annotated_frames(folder: str | Path) -> list[AnnotatedFrame]:
     if not folder.is_dir():
         raise FileFormatError(f"{folder}: found no such folder, expected one with images and .pts files")
     frames = []
-    for path in sorted(folder.glob("*.pts")):
+    for path in visible_files(folder, [".pts"]):
         image_path = next((image for end in IMAGE_ENDINGS if (image := path.with_suffix(end)).is_file()), None)
         if image_path is None:
             raise FileFormatError(f"{path}: found no image beside it, expected {path.stem}.png or another")
