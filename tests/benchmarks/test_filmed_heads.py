@@ -17,7 +17,7 @@ from torchface.progress import silent
 from torchface.rig import BlendshapeRig
 from torchface.workflows.surface_sites import sites_on_rig
 from torchface.workflows.track.frame_readings import read_frames
-from torchface.workflows.track.person_head import person_head
+from torchface.workflows.track.person_head import HeadFrames, person_head
 from torchface.workflows.track.take_solution import smoothed_landmarks
 from torchface.workflows.track.track_inputs import TrackSettings, load_inputs
 from torchface.workflows.track.track_state import TrackState
@@ -43,10 +43,11 @@ def test_heads_of_films(data: Path) -> None:
         marks = smoothed_landmarks(inputs, reading, None)
         bare = replace(inputs, models=replace(inputs.models, places=torch.zeros(0, 3)))
         unread = replace(reading, expression=torch.full_like(reading.expression, torch.nan))
+        filmed = HeadFrames.of(inputs, marks, reading)
         heads = [
             inputs.actor,
-            person_head(bare, inputs.heads, marks, unread, silent).rig,
-            person_head(inputs, inputs.heads, marks, reading, silent).rig,
+            person_head(bare, inputs.heads, HeadFrames(filmed.numbers), marks, unread, silent).rig,
+            person_head(inputs, inputs.heads, filmed, marks, reading, silent).rig,
         ]
         truth = film.person.head.rest[film.person.kind.dense]
 

@@ -10,6 +10,7 @@ import torch
 import trimesh
 from torch import Tensor
 
+from planted.photographed_heads import bent, to_surface
 from torchface import BlendshapeRig, Mesh
 from torchface.geometry.cameras.pinhole import Camera, look_at
 from torchface.geometry.rotations import rotation_matrix
@@ -55,24 +56,6 @@ def person(seed: int) -> Mesh:
 @pytest.fixture(scope="module")
 def shot() -> Taken:
     return taken(person(21))
-
-
-def bent(head: Mesh) -> Tensor:
-    """Smooth displacements (V,3) of a head: nose, chin, brow and cheeks of another form, 6 mm out and in."""
-    at = head.vertices[head.landmarks[[30, 8, 27]]].double()
-    cheeks = head.vertices[head.landmarks[[41, 46]]].double() + torch.tensor([0.0, -25.0, 0.0])
-    near = torch.exp(-torch.cdist(head.vertices.double(), torch.cat([at, cheeks])).square() / (2 * 15.0**2))
-    ways = torch.tensor([-6.0, 6.0, 6.0, 6.0, -6.0], dtype=torch.float64)
-    return (near @ ways)[:, None] * torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
-
-
-def to_surface(points: Tensor, mesh: Mesh) -> float:
-    """The mean distance of points (P,3) to a mesh after the best similarity, millimetres."""
-    true = trimesh.Trimesh(mesh.vertices.numpy(), mesh.faces.numpy(), process=False)
-    for _ in range(8):
-        near, _, _ = trimesh.proximity.closest_point(true, points.numpy())
-        points = similarity_transform(points[None], torch.from_numpy(near)[None]).apply(points[None])[0]
-    return float(trimesh.proximity.closest_point(true, points.numpy())[1].mean())
 
 
 def inner_face(mesh: Mesh) -> Tensor:

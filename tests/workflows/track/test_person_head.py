@@ -1,5 +1,6 @@
 """Without a rig the head of whoever is seen is solved with the take, and the weights on it."""
 
+import math
 import re
 from dataclasses import replace
 from pathlib import Path
@@ -8,18 +9,23 @@ import pytest
 import torch
 from torch import Tensor
 
-from planted.photographed_heads import aligned_error
+from planted.photographed_heads import aligned_error, bent, to_surface
 from torchface import BlendshapeRig, Take, Track, load_rig, save_rig
 from torchface.errors import TopologyError
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.geometry.similarity import similarity_transform
 from torchface.io.landmarks.openface_csv import save_landmarks_csv
-from torchface.synthetic import draw_identities, performer
-from torchface.workflows.track.track_inputs import TrackSettings
+from torchface.io.video import write_video
+from torchface.landmarks import FaceReading
+from torchface.progress import silent
+from torchface.rendering.clay_shading import Lighting, render
+from torchface.synthetic import character, draw_identities, performer
+from torchface.workflows.track.person_head import HeadFrames, person_head
+from torchface.workflows.track.track_inputs import TrackSettings, load_inputs
 from torchface.workflows.track.track_video import track_video
 
-COUNT, WIDTH, HEIGHT = 12, 640, 480
+COUNT, WIDTH, HEIGHT, SIDE = 12, 640, 480, 360
 SHAPES = ["jawOpen", "mouthSmileLeft", "mouthSmileRight", "browInnerUp"]
 
 
@@ -91,3 +97,32 @@ def test_a_rig_of_another_topology_is_refused(
     settings = TrackSettings(landmarks=take[0], size=(WIDTH, HEIGHT), anybody=True, heads="head")
     with pytest.raises(TopologyError, match="expected the model's 6419"):
         track_video(None, tmp_path / "dome.glb", tmp_path / "out", settings)
+
+
+def test_the_skin_that_frames_show_moves_the_head(tmp_path: Path) -> None:
+    """Of a face whose form the model does not know."""
+    known = character(performer(draw_identities(1, torch.Generator().manual_seed(21))[0]), size=512).rig.neutral
+    true = known.with_vertices(known.vertices + bent(known).float())
+    focal = float(assumed_calibration(SIDE, SIDE).intrinsics[0, 0])
+    middle, field = true.vertices[true.landmarks[27:]].double().mean(0), math.degrees(2 * math.atan(SIDE / 2 / focal))
+    cameras = [look_at(middle, yaw, 3.0, 280.0, SIDE, SIDE, field) for yaw in (-24.0, 0.0, 24.0)]
+    frames = [render(true, camera, lighting=Lighting(occlusion_rays=0))[:3] for camera in cameras]
+    write_video([frame[None] for frame in frames], tmp_path / "film.mkv", 25.0)
+    marks = torch.stack([camera.project(true.vertices[true.landmarks].double()) for camera in cameras])
+    names = tuple(str(i) for i in range(68))
+    save_landmarks_csv(Take(25.0, landmarks=Track(names, marks.float())), tmp_path / "take.csv")
+    inputs = load_inputs(tmp_path / "film.mkv", None, TrackSettings(landmarks=tmp_path / "take.csv", heads="head"))
+    reading = FaceReading(marks, torch.ones(3, 68), torch.ones(3, 68), torch.ones(3))
+    filmed = HeadFrames.of(inputs, marks, reading)
+    assert filmed.numbers.tolist() == [0, 1, 2]
+    for picture, frame in zip(filmed.pictures, frames, strict=True):
+        assert float((picture / 255 - frame).abs().mean()) < 0.01
+    heads = [
+        person_head(inputs, inputs.heads, some, marks, reading, silent).fit
+        for some in (HeadFrames(filmed.numbers), filmed)
+    ]
+    assert [one.agreement is None for one in heads] == [True, False]
+    before, after = (
+        to_surface(one.vertices[bent(one).norm(dim=1) > 0.5].double(), true) for one in (heads[0].mesh, heads[1].mesh)
+    )
+    assert after < 0.85 * before

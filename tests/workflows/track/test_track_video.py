@@ -16,13 +16,14 @@ from tests.workflows.track.conftest import FRAMES, QUICK, Done, Filmed
 from torchface import BlendshapeRig, load_rig, load_take, save_rig
 from torchface.errors import FileFormatError, ValueRangeError
 from torchface.geometry.cameras.calibration import assumed_calibration
+from torchface.geometry.cameras.distortion import undistort_image
 from torchface.geometry.rotations import rotation_matrix
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.video import VideoFile, open_video, write_video
 from torchface.shape_names import ARKIT
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.head_rotations import head_angles
-from torchface.workflows.track.overlay_video import head_window, mesh_drawer, undistorted
+from torchface.workflows.track.overlay_video import head_window, mesh_drawer
 from torchface.workflows.track.take_solution import known_offsets
 from torchface.workflows.track.track_inputs import TrackInputs, TrackSettings
 from torchface.workflows.track.track_models import TrackModels
@@ -95,7 +96,7 @@ def test_the_mesh_and_the_landmarks_are_drawn_where_they_are(done: Done, filmed:
     cheek = (y[0] + y[1]) // 2, (x[0] + x[1]) // 2
     assert not torch.equal(drawn[:, cheek[0], cheek[1]], frame[:, cheek[0], cheek[1]])
     assert torch.equal(drawn[:, :, :10], frame[:, :, :10])
-    assert torch.equal(undistorted(frame, tracked.calibration), frame)
+    assert torch.equal(undistort_image(frame, tracked.calibration), frame)
 
 
 def test_head_angles_are_yaw_pitch_and_roll() -> None:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.own_rig.face_points import FacePoints
-from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.cameras.distortion import undistort_image
 from torchface.geometry.cameras.pinhole import Camera
 from torchface.io.video import write_video
 from torchface.landmarks.images.boxes.face_box import interleaved
@@ -96,7 +96,7 @@ def mesh_drawer(tracked: Tracked) -> Callable[[int, Tensor], Tensor]:
     def draw(t: int, frame: Tensor) -> Tensor:
         if not tracked.seen[t]:
             return frame
-        picture, camera = interleaved(undistorted(frame, tracked.calibration)), camera_at(tracked, t)
+        picture, camera = interleaved(undistort_image(frame, tracked.calibration)), camera_at(tracked, t)
         drawn = clay.draw(rig(weights[t : t + 1].to(rig.deltas))[0], camera)
         covered = (drawn != np.array(BACKGROUND, np.uint8)).any(2, keepdims=True)
         blue = np.ascontiguousarray(drawn[..., ::-1])  # clay that is not the colour of skin
@@ -119,15 +119,6 @@ def camera_at(tracked: Tracked, t: int) -> Camera:
         clip.width,
         clip.height,
     )
-
-
-def undistorted(frame: Tensor, calibration: CameraCalibration) -> Tensor:
-    """What a camera without distortion would have seen, uint8 (3,H,W)."""
-    if not calibration.distortion.any():
-        return frame
-    image = np.ascontiguousarray(frame.permute(1, 2, 0).numpy())
-    straight = cv2.undistort(image, calibration.intrinsics.numpy(), calibration.distortion.numpy())
-    return torch.from_numpy(straight).permute(2, 0, 1)
 
 
 def head_window(tracked: Tracked) -> Camera:

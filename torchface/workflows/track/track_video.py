@@ -1,7 +1,7 @@
 """From a video of a face and the actor's rig on disk to weights, animation, landmarks and an overlay on disk."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +16,7 @@ from torchface.files.job_lock import holds_out, within_job
 from torchface.files.whole_files import all_or_none
 from torchface.io import save_rig
 from torchface.landmarks.images.face_reading import FaceReading
-from torchface.modeling import FitSettings, HeadModel
+from torchface.modeling import FitSettings
 from torchface.modeling.photographs.image_fit import with_skin
 from torchface.progress import Progress, silent
 from torchface.synthetic.head.embedded_character import is_performers
@@ -25,8 +25,8 @@ from torchface.workflows.fit.video_pictures import sharpness_of
 from torchface.workflows.named_finders import part_finder
 from torchface.workflows.track.camera_views import other_cameras
 from torchface.workflows.track.frame_readings import read_frames
-from torchface.workflows.track.overlay_video import undistorted, write_overlay
-from torchface.workflows.track.person_head import PersonHead, person_head
+from torchface.workflows.track.overlay_video import write_overlay
+from torchface.workflows.track.person_head import HeadFrames, PersonHead, person_head
 from torchface.workflows.track.take_measurements import (
     measured_trust,
     measuring_solver,
@@ -95,10 +95,11 @@ def track_video(
     head = None
     if inputs.heads is not None:
         with _timed(seconds, "head"):
-            head = person_head(inputs, inputs.heads, landmarks, reading, progress)
+            filmed = HeadFrames.of(inputs, landmarks, reading)
+            head = person_head(inputs, inputs.heads, filmed, landmarks, reading, progress)
         if video is not None:
             with _timed(seconds, "skin"):
-                head = with_filmed_skin(head, inputs, inputs.heads, reading, progress)
+                head = with_filmed_skin(head, filmed.pictures, inputs, reading, progress)
         inputs = replace(inputs, actor=head.rig)
     trust, solver = reading.trust, inputs.solver(inputs.clip.fps, MOTION if inputs.models.expects else None)
     offsets = known_offsets(inputs, out)
@@ -179,22 +180,17 @@ _SHARP = 0.6  # of the sharpest frame
 
 
 def with_filmed_skin(
-    head: PersonHead, inputs: TrackInputs, model: HeadModel, reading: FaceReading, progress: Progress
+    head: PersonHead, filmed: Sequence[Tensor], inputs: TrackInputs, reading: FaceReading, progress: Progress
 ) -> PersonHead:
-    """A head as it is shown: with skin of sharp frames from the front and from each side, and what belongs to it."""
+    """A head as it is shown, by the pictures of its frames: with skin of sharp frames from the front and from each
+    side, and what belongs to it."""
     progress("finding the head's skin")
-    wanted = dict.fromkeys(head.frames.tolist())
-    for number, frame in enumerate(inputs.clip.color_frames()):
-        if number in wanted:
-            wanted[number] = undistorted(frame, inputs.calibration)
-        if number >= max(wanted):
-            break
-    rows = _chosen(head, [frame for frame in wanted.values() if frame is not None], reading)
+    rows = _chosen(head, filmed, reading)
     frames = head.frames[rows]
-    pictures = [wanted[number] for number in frames.tolist()]
-    images = [picture.float() / 255 for picture in pictures if picture is not None]
+    pictures = [filmed[row] for row in rows]
+    images = [picture.float() / 255 for picture in pictures]
     marks = head.fit.landmarks[rows].double()
-    parts = [part_finder()(picture, one) for picture, one in zip(pictures, marks, strict=True) if picture is not None]
+    parts = [part_finder()(picture, one) for picture, one in zip(pictures, marks, strict=True)]
     whole = is_performers(head.rig)
     settings = FitSettings(parts=parts, paint_hair=not whole, irises=reading.iris[frames])
     views = replace(
@@ -204,13 +200,13 @@ def with_filmed_skin(
         landmarks=head.fit.landmarks[rows],
         residuals=head.fit.residuals[rows],
     )
-    fit = with_skin(views, model, images, settings)
-    assert inputs.actor is not None
+    assert inputs.heads is not None
+    fit = with_skin(views, inputs.heads, images, settings)
     dressed = dressed_rig(head.rig, inputs.actor, fit, images, parts, marks, whole)
     return replace(head, shown=dressed.rig.select(head.rig.names), surface=dressed.surface)
 
 
-def _chosen(head: PersonHead, pictures: list[Tensor], reading: FaceReading) -> list[int]:
+def _chosen(head: PersonHead, pictures: Sequence[Tensor], reading: FaceReading) -> list[int]:
     """Which of the head's frames show the skin: from the front, from the left and from the right, of the sharp ones
     that in which the face acts least, for a smile paints its folds and the light on its cheeks."""
     ahead = torch.stack([camera.rotation[2] for camera in head.fit.cameras])
