@@ -141,8 +141,10 @@ def test_what_a_blink_meets_with_other_shapes_bends_it_little() -> None:
     own = with_bulge(rig.select([n for n in rig.names if n.startswith("eye") and n.endswith("Left")]), 3.0)
     parts, blink = inner_parts(own), own.names.index("eyeBlinkLeft")
     alone = clear_parts(own, parts, torch.eye(len(own.names)))
-    bent = (clear_parts(own, parts).deltas - alone.deltas)[blink]
-    assert float(bent.norm(dim=-1).max()) < 1.2
+    bent = (clear_parts(own, parts).deltas - alone.deltas).norm(dim=-1)
+    assert float(bent[blink].max()) < 1.2
+    # Spread over more of the lids it crumpled them, and real heads' eyeWide looked like eyeLookUp.
+    assert int((bent > 0.3)[:, own.neutral.regions["face"]].sum(1).max()) < 50
 
 
 @pytest.mark.parametrize("strange", [False, True])
