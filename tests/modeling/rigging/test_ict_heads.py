@@ -78,6 +78,8 @@ def test_of_an_open_mouth_both_rows_of_teeth_come_nearer_to_each_other_and_nothi
     pose = rig.vertices + rig.deltas
     assert pose[0, :, 1].tolist() == [0.0, -28.0, -30.0]
     assert pose[1, :, 1].tolist() == [0.0, -2.0, 0.0]
+    face = rig.part(~rig.neutral.regions["teeth"])  # no row of teeth is looked for
+    assert with_teeth_in_sight(face) is face
 
 
 def seen(mesh: Mesh, vertices: Tensor, marks: slice, parts: tuple[str, ...], clear: Tensor) -> int:

@@ -87,6 +87,8 @@ def with_teeth_in_sight(rig: BlendshapeRig) -> BlendshapeRig:
     """A rig whose open mouth shows teeth: ICT-FaceKit's lips hide all of both rows however far the jaw opens."""
     jaw = rig.names.index("jawOpen")
     vertices, deltas, teeth = rig.vertices.clone(), rig.deltas.clone(), region(rig.neutral, "teeth")
+    if not bool(teeth.any()):  # a part of the head, such as the face
+        return rig
     lower = teeth & (deltas[jaw, :, 1] < 0.1 * deltas[jaw, teeth, 1].amin())
     vertices[teeth & ~lower, 1] -= _LONGER
     deltas[jaw, lower, 1] += _RAISED
