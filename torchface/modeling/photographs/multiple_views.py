@@ -26,10 +26,10 @@ _FAR, _OFF = 3.0, 2.0  # deviations, and medians of all, beyond which a match ha
 _LIDS = 1.25  # radii of an eyeball about its middle, where lids end
 _EXACT = 1e-6  # deviation of a focal length's logarithm that is taken as known
 # Of a result that counts: how many match, how far they are off (pixels), and beside before; what flow errs by is beyond
-# doubt. Of pictures and films of rendered people and of a real scan 28 of 31 heads came nearer to the truth below
-# 0.45 of before, none of 15 above it, which were all off by more than 0.5 pixels.
-_LEAST_MATCHES, _MOST_OFF, _GAIN = 150, 0.75, 0.45
-_LITTLE, _LITTLE_GAIN = 0.4, 0.8
+# doubt. By pictures and films of rendered people and of a real scan: below 0.36 heads came nearer to the truth, but for
+# one person's and one pair of photographs; above 0.4 they went away from it.
+_LEAST_MATCHES, _MOST_OFF, _GAIN = 150, 0.75, 0.38
+_LITTLE, _LITTLE_GAIN = 0.38, 0.8
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,24 +104,25 @@ def agreed_skin(
     lenses = torch.zeros(1 if head.shared_focal else len(cameras), dtype=torch.float64)
     state = _State(torch.zeros(forms.count, dtype=torch.float64), cameras, lenses)
     held = marks.matches(head.posed[0], pieces)
-    sites, off = 0, list[float]()  # before each round's steps
-    for _ in range(_ROUNDS):
+    sites, before, after = 0, torch.nan, torch.nan
+    for number in range(_ROUNDS):
         posed = head.moved(forms.field(state.forms)).posed
         matches = match_skin(posed, state.cameras, pieces, parts)
         if matches is None or int((~matches.own).sum()) < _LEAST_MATCHES:
             return None
         sites = len(matches.triangles)
         problem = _Bundle.of(matches.joined(held), head, forms)
-        off.append(problem.disagreement(state))
+        before = before if number else problem.disagreement(state)
         for _ in range(_STEPS):
             state = problem.step(state)
+        after = problem.disagreement(state)
     coarse = sum(max(1.0, piece.scale) for piece in pieces) / len(pieces)
-    if not off[-1] < min(_MOST_OFF * coarse, max(_GAIN * off[0], min(_LITTLE, _LITTLE_GAIN * off[0]))):
+    if not after < min(_MOST_OFF * coarse, max(_GAIN * before, min(_LITTLE, _LITTLE_GAIN * before))):
         return None
     back = zip(pieces, state.cameras, head.cameras, strict=True)
     seen = tuple(piece.whole(camera, like) for piece, camera, like in back)
     moved = behind_lids(head.posed[0], forms.field(state.forms))
-    return SkinAgreement(moved, seen, sites, off[0], off[-1])
+    return SkinAgreement(moved, seen, sites, before, after)
 
 
 def behind_lids(mesh: Mesh, field: Tensor) -> Tensor:
