@@ -10,6 +10,7 @@ from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Mesh, Take, Track, save_rig, save_take, zoo
 from torchface.enhancement import CapturedPerformance, EnhancementModel, EnhancementSettings
+from torchface.io import MeshSequenceWriter
 from torchface.progress import silent
 from torchface.synthetic import performer
 from torchface.synthetic.stages import place_markers
@@ -44,6 +45,18 @@ def folded(frames: Tensor, neutral: Tensor) -> Tensor:
 
 def coarse(actor: Actor, path: Path, state: Path, **given: Any) -> Any:
     return read_coarse(path, actor.mesh, InputSettings(**given), state, silent)
+
+
+def written(path: Path, frames: Tensor, faces: Tensor) -> Path:
+    with MeshSequenceWriter(path, len(frames), frames.shape[1], faces) as writer:
+        writer.append(frames)
+    return path
+
+
+def shuffled(actor: Actor) -> tuple[Tensor, Tensor]:
+    """Another order of the vertices, and the triangles in it."""
+    order = torch.randperm(len(actor.mesh.vertices), generator=torch.Generator().manual_seed(1))
+    return order, order.argsort()[actor.mesh.faces]
 
 
 @pytest.fixture(scope="package")
