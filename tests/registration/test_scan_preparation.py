@@ -105,10 +105,10 @@ def test_a_scan_of_one_side_of_the_face_is_said() -> None:
 @pytest.mark.parametrize(
     ("regions", "words"),
     [
-        (("nose", "nostrils"), "of the nose"),
+        pytest.param(("nose", "nostrils"), "of the nose", marks=pytest.mark.bench),
         (("chin",), "of the chin"),
-        (("cheek_left", "cheek_right"), "of the cheeks"),
-        (("lids_left", "lids_right"), "of the eyes"),
+        pytest.param(("cheek_left", "cheek_right"), "of the cheeks", marks=pytest.mark.bench),
+        pytest.param(("lids_left", "lids_right"), "of the eyes", marks=pytest.mark.bench),
         (("upper_lip", "lower_lip", "cheek_left"), "of the mouth"),
         (("forehead", "cheek_left", "lids_left"), ""),
     ],

@@ -173,6 +173,7 @@ def test_curves_bend_in_seconds_where_frames_were_dropped(performance: Performan
     assert float((shrunk - expected).abs().max()) > 0.01  # as if nothing were missing
 
 
+@pytest.mark.bench
 def test_a_variable_rate_is_solved_as_well_as_an_even_one(performance: Performance) -> None:
     rig, attachment, takes = performance
     true = takes[0][:160]

@@ -143,10 +143,10 @@ def test_the_page_hands_takes_over(server: PageServer, desk: Desk) -> None:
 def test_a_pose_ends_with_the_page_that_has_asked_for_it_and_with_no_other(server: PageServer, desk: Desk) -> None:
     first, other, last = ({"controls": {"solver": {"pose": pose}}} for pose in (2, 0, 3))
     address = server.url.replace("http", "ws") + "socket"
-    with connect(address) as posing:
+    with connect(address, max_queue=None) as posing:
         posing.send(json.dumps(first))
         until(lambda: desk.messages, 10)
-        with connect(address) as page:
+        with connect(address, max_queue=None) as page:
             page.send(json.dumps(other))
             page.send(json.dumps({"reset": True}))
             until(lambda: len(desk.messages) == 2, 10)

@@ -65,18 +65,32 @@ def recorded(came: np.ndarray, dome: Path, folder: Path) -> tuple[list[Take], fl
     return takes, json.loads((folder / "summary.json").read_text())["fps"], figures.fps
 
 
+CASES = [
+    *[(np.arange(COUNT) / fps, fps) for fps in (24000 / 1001, 30000 / 1001, 60000 / 1001, 60.0)],
+    *[(EVEN + 0.001 * NOISE, 60.0), (np.sort(EVEN + 0.03 * NOISE), 60.0)],
+    *[(at_once(2), 60.0), (at_once(3), 60.0), (at_once(4), 60.0), (EVEN // (1 / 30) / 30, 60.0)],
+    *[(EVEN + PAUSE, 60.0), (EVEN + 0.001 * NOISE + PAUSE, 60.0), (np.sort(EVEN + 0.03 * NOISE) + PAUSE, 60.0)],
+    *[(at_once(2) + PAUSE, 60.0), (at_once(4) + PAUSE, 60.0), (EVEN + 20 * PAUSE, 60.0)],
+    *[(np.arange(20.0) + 0.03 * NOISE[:20], 1.0), (np.array([0, 1 / 60]), 60.0), (np.array([0, 1.0]), 1.0)],
+    (np.array([0.0, 0.0]), 60.0),  # times that say nothing: the source's rate
+    (np.cumsum(1 + NOISE) / 30, COUNT / float((1 + NOISE).sum() / 30)),
+]
+WRITTEN = (0, 5, 8, 12, 19, 20)
+"""The cases of which everyday tests write files."""
+
+
+@pytest.mark.parametrize(("came", "fps"), CASES)
+def test_a_take_has_the_senders_rate_and_its_length(came: np.ndarray, fps: float) -> None:
+    times, sent = np.array(shown(came + 1000.0)[15:]).T  # what is before the first frame is no part of a take
+    kept, found, seconds = take_times(times, sent.astype(bool), np.full(len(times), np.nan), 60.0)
+    assert found == pytest.approx(fps, rel=0.01)
+    longest = (len(kept) - 1) / found if seconds is None else float(seconds[-1])
+    assert longest == pytest.approx(came[-1] - came[0] if came[-1] else 1 / 60, abs=0.03)
+
+
 @pytest.mark.parametrize(
     ("came", "fps"),
-    [
-        *[(np.arange(COUNT) / fps, fps) for fps in (24000 / 1001, 30000 / 1001, 60000 / 1001, 60.0)],
-        *[(EVEN + 0.001 * NOISE, 60.0), (np.sort(EVEN + 0.03 * NOISE), 60.0)],
-        *[(at_once(2), 60.0), (at_once(3), 60.0), (at_once(4), 60.0), (EVEN // (1 / 30) / 30, 60.0)],
-        *[(EVEN + PAUSE, 60.0), (EVEN + 0.001 * NOISE + PAUSE, 60.0), (np.sort(EVEN + 0.03 * NOISE) + PAUSE, 60.0)],
-        *[(at_once(2) + PAUSE, 60.0), (at_once(4) + PAUSE, 60.0), (EVEN + 20 * PAUSE, 60.0)],
-        *[(np.arange(20.0) + 0.03 * NOISE[:20], 1.0), (np.array([0, 1 / 60]), 60.0), (np.array([0, 1.0]), 1.0)],
-        (np.array([0.0, 0.0]), 60.0),  # times that say nothing: the source's rate
-        (np.cumsum(1 + NOISE) / 30, COUNT / float((1 + NOISE).sum() / 30)),
-    ],
+    [pytest.param(*one, marks=() if number in WRITTEN else pytest.mark.bench) for number, one in enumerate(CASES)],
 )
 def test_all_files_of_a_take_have_the_senders_rate_and_the_same_times(
     came: np.ndarray, fps: float, dome: Path, tmp_path: Path

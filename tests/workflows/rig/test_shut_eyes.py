@@ -61,14 +61,23 @@ def test_a_scans_texture_shows_its_eyes(rig: BlendshapeRig, blink: float, taken:
         assert re.search(note, notes[0])
 
 
-@pytest.mark.parametrize(("left", "right", "taken", "note"), [
+EYES = [
     (1.0, 0.0, (0.0, 0.0), "scan's left eye is shut, .* taken as open: --pose eyeBlinkLeft=1 gives"),
     (0.0, 0.0, (1.0, 0.0), "scan's left eye is open, .* taken as shut: leave out --pose eyeBlinkLeft=1$"),
     (1.0, 1.0, (1.0, 0.0), "scan's right eye is shut, .*: --pose eyeBlinkLeft=1 eyeBlinkRight=1 gives"),
     (1.0, 0.0, (0.0, 1.0), "left eye is shut, .* right eye is open, .*: --pose eyeBlinkLeft=1 gives"),
     (0.0, 1.0, (0.0, 1.0), ""),
-])  # fmt: skip
-@pytest.mark.parametrize("colored", [True, False])
+]
+
+
+@pytest.mark.parametrize(  # each in one of the two ways everyday
+    ("left", "right", "taken", "note", "colored"),
+    [
+        pytest.param(*one, colored, marks=() if colored == (number % 2 == 0) else pytest.mark.bench)
+        for number, one in enumerate(EYES)
+        for colored in (True, False)
+    ],
+)
 def test_each_eye_is_judged_for_itself(
     rig: BlendshapeRig, left: float, right: float, taken: tuple[float, float], note: str, colored: bool
 ) -> None:

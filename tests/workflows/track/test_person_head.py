@@ -4,13 +4,16 @@ import math
 import re
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 import torch
 from torch import Tensor
+from torch.nn.functional import interpolate
 
 from planted.photographed_heads import aligned_error, bent, to_surface
-from torchface import BlendshapeRig, Take, Track, load_rig, save_rig
+from torchface import BlendshapeRig, Take, Track, load_rig, load_take, save_rig
 from torchface.errors import TopologyError
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.geometry.cameras.pinhole import look_at
@@ -21,6 +24,7 @@ from torchface.landmarks import FaceReading
 from torchface.progress import silent
 from torchface.rendering.clay_shading import Lighting, render
 from torchface.synthetic import character, draw_identities, performer
+from torchface.workflows.track import person_head as module
 from torchface.workflows.track.person_head import HeadFrames, person_head
 from torchface.workflows.track.track_inputs import TrackSettings, load_inputs
 from torchface.workflows.track.track_video import track_video
@@ -99,6 +103,30 @@ def test_a_rig_of_another_topology_is_refused(
         track_video(None, tmp_path / "dome.glb", tmp_path / "out", settings)
 
 
+def test_the_head_is_fitted_to_pictures_of_the_frames_that_differ(
+    take: tuple[Path, Tensor], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What the skin in several pictures does to a fit is tried in test_multiple_views.py."""
+    colors = 255 * torch.rand(COUNT, 3, 6, 8, generator=torch.Generator().manual_seed(0))
+    film = interpolate(colors, size=(HEIGHT, WIDTH), mode="bilinear").to(torch.uint8)
+    write_video([film], tmp_path / "film.mkv", 25.0)
+    inputs = load_inputs(tmp_path / "film.mkv", None, TrackSettings(landmarks=take[0], heads="head"))
+    marks, sure = load_take(take[0]).landmarks.values.double(), torch.ones(COUNT, 68)
+    reading = FaceReading(marks, sure, sure, sure[:, 0])
+    filmed = HeadFrames.of(inputs, marks, reading)
+    fitted: list[tuple[Any, ...]] = []
+    monkeypatch.setattr(module, "fit_images", lambda *given, **_: fitted.append(given) or SimpleNamespace(mesh=None))
+    monkeypatch.setattr(module, "transfer_with_report", lambda rig, *_, **__: SimpleNamespace(rig=rig))
+    for some in (HeadFrames(filmed.numbers), filmed):
+        person_head(inputs, inputs.heads, some, marks, reading, silent)
+    (*_, without), (*_, pictures) = fitted
+    assert without is None
+    assert 2 < len(pictures) < COUNT
+    for number, picture in zip(filmed.numbers.tolist(), pictures, strict=True):
+        assert float((picture - film[number] / 255).abs().mean()) < 0.01
+
+
+@pytest.mark.bench  # ten seconds
 def test_the_skin_that_frames_show_moves_the_head(tmp_path: Path) -> None:
     """Of a face whose form the model does not know."""
     known = character(performer(draw_identities(1, torch.Generator().manual_seed(21))[0]), size=512).rig.neutral

@@ -74,7 +74,7 @@ def on_a_helmet(take: Take, rows: list[int]) -> Take:
     return replace(take, markers=Track(take.markers.names, values))
 
 
-@pytest.mark.parametrize("rows", [[4, 30, 55, 80], [1, 2, 3, 4]])
+@pytest.mark.parametrize("rows", [[4, 30, 55, 80], pytest.param([1, 2, 3, 4], marks=pytest.mark.bench)])
 def test_markers_on_the_helmet_are_named_and_disturb_no_other(performance: Performance, rows: list[int]) -> None:
     rig, attachment, _ = performance
     take = on_a_helmet(filmed(performance), rows)

@@ -31,9 +31,15 @@ def neighbour(markers: Tensor, a: int, rank: int) -> int:
     return int((median - median[a]).norm(dim=1).argsort()[rank])
 
 
-@pytest.mark.parametrize("rank", [1, 3, 60])
-@pytest.mark.parametrize("marker", [0, 23, 71])
-@pytest.mark.parametrize(("first", "last"), [(120, 121), (40, 67), pytest.param(20, 155, marks=pytest.mark.bench)])
+@pytest.mark.parametrize(  # each marker, rank and stretch twice or thrice everyday
+    ("marker", "rank", "first", "last"),
+    [
+        pytest.param(marker, rank, *part, marks=() if (i + j + k) % 3 == 0 and k < 2 else pytest.mark.bench)
+        for i, marker in enumerate((0, 23, 71))
+        for j, rank in enumerate((1, 3, 60))
+        for k, part in enumerate([(120, 121), (40, 67), (20, 155)])
+    ],
+)
 def test_labels_exchanged_in_less_than_half_are_found_by_shape(
     markers: Tensor, marker: int, rank: int, first: int, last: int
 ) -> None:

@@ -89,7 +89,7 @@ def spoiled(take: Take) -> Take:
     return replace(take, markers=Track(take.markers.names, values))
 
 
-@pytest.mark.parametrize("slip", [False, True])
+@pytest.mark.parametrize("slip", [pytest.param(False, marks=pytest.mark.bench), True])
 def test_each_defect_is_named_with_its_frames(performance: Performance, stage_space: Similarity, slip: bool) -> None:
     rig, attachment, takes = performance
     flaws = StageFlaws(slip_translation=8, slip_rotation=3) if slip else StageFlaws()

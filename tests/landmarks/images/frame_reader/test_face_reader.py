@@ -250,15 +250,14 @@ def test_a_plain_wall_is_no_face_for_long(
 @pytest.mark.parametrize(
     "film",
     [
-        {},
-        {"start": 400.0, "end": -160.0},
-        {"tint": (1.0, 1.0, 1.0)},
-        {"hidden": 0.8},
-        {"larger": 1.4},
-        {"stays": 5.0, "fps": 15},
-        {"stays": 2.0, "tint": (1.0, 1.0, 1.0)},
+        pytest.param({"start": 400.0, "end": -160.0}, id="passing"),
+        pytest.param({"tint": (1.0, 1.0, 1.0)}, id="alike"),
+        pytest.param({}, id="beside", marks=pytest.mark.bench),
+        pytest.param({"hidden": 0.8}, id="slow", marks=pytest.mark.bench),
+        pytest.param({"larger": 1.4}, id="near", marks=pytest.mark.bench),
+        pytest.param({"stays": 5.0, "fps": 15}, id="before", marks=pytest.mark.bench),
+        pytest.param({"stays": 2.0, "tint": (1.0, 1.0, 1.0)}, id="alike before", marks=pytest.mark.bench),
     ],
-    ids=["beside", "passing", "alike", "slow", "near", "before", "alike before"],
 )
 def test_it_stays_with_a_person_before_whom_another_passes(webcam: Webcam, film: dict[str, Any]) -> None:
     """Reader and tracker alike: never for two frames with the other, soon with the first again; others are counted."""

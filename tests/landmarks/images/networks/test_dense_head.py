@@ -16,7 +16,7 @@ from torchface.landmarks.images.networks.landmark_training import cropped, openi
 from torchface.landmarks.images.networks.picture_augmentation import AugmentationSettings
 from torchface.onnx import export_model
 from torchface.shape_names import ARKIT, mirror
-from train.rendered_people.face_picture import draw_pictures
+from train.rendered_people.face_picture import FacePicture, draw_pictures
 from train.rendered_people.head_kind import performer_kind
 
 SMALL = {"size": 64, "margin": 1.25, "channels": (8, 12, 16, 24), "blocks": (1, 1, 1), "decoder": 16}
@@ -25,9 +25,15 @@ PLAIN = AugmentationSettings(turn=0.0, scale=0.0, shift=0.0, hidden=0.0, absent=
 
 
 @pytest.fixture(scope="module")
-def faces() -> torch.Tensor:
-    """Landmarks of rendered people, (4,68,2)."""
-    return torch.stack([one.landmarks for one in draw_pictures((performer_kind(),), (1.0,), 0, 4, seed=2)])
+def pictures() -> list[FacePicture]:
+    """Four rendered people."""
+    return draw_pictures((performer_kind(),), (1.0,), 0, 4, seed=2)
+
+
+@pytest.fixture(scope="module")
+def faces(pictures: list[FacePicture]) -> torch.Tensor:
+    """Their landmarks, (4,68,2)."""
+    return torch.stack([one.landmarks for one in pictures])
 
 
 @pytest.fixture(scope="module")
@@ -160,9 +166,8 @@ def test_openings_that_are_drawn_toward_their_mean_cost_more(faces: torch.Tensor
     assert float(opening_loss(read, truth, sure)) > float(opening_loss(noisy, truth, sure))
 
 
-def test_training_finds_points_and_weights_beside_the_68(faces: torch.Tensor) -> None:
+def test_training_finds_points_and_weights_beside_the_68(pictures: list[FacePicture], faces: torch.Tensor) -> None:
     network = zoo.get_model("landmark_network").with_points(torch.rand(4, 3), TWINS, hidden=12).eval()
-    pictures = draw_pictures((performer_kind(),), (1.0,), 0, 4, seed=2)
     rgba = torch.stack([one.rgba for one in pictures])
     points = faces[:, [36, 45, 27, 30]] + torch.tensor([0.0, 4.0])
     weights = torch.rand(4, 52, generator=torch.Generator().manual_seed(3))
