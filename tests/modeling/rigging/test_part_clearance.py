@@ -19,6 +19,7 @@ from torchface.modeling.rigging.transfer_system import ShapeTransfer
 from torchface.registration import Registration
 from torchface.rendering.raycast import RayCaster
 from torchface.synthetic import IDENTITY, performer
+from torchface.synthetic.head.embedded_character import character
 
 MOVED = torch.tensor([1.5, -1.0, -2.5])
 
@@ -180,6 +181,22 @@ def test_a_registration_that_bent_eyeballs_gets_round_ones_behind_the_lids() -> 
     off = (found[balls] - eyes(template, parts, true.with_vertices(found))[0][parts.group]).norm(dim=-1)
     own = (true.vertices[balls].double() - centres[parts.group]).norm(dim=-1)
     assert float((off - own * off.mean() / own.mean()).abs().max()) < 0.1
+
+
+@pytest.mark.parametrize(("higher", "wider"), [(-4.0, 1.0), (4.0, 1.0), (3.0, 1.15)])
+def test_teeth_show_under_a_longer_or_shorter_upper_lip_as_in_the_template(higher: float, wider: float) -> None:
+    """Placed by all the skin before them they hung 5.4 mm under the lip of a real scan."""
+    template = character(size=64).rig.select(["jawOpen", "mouthSmileLeft", "mouthFunnel"])
+    parts, rest = inner_parts(template), template.vertices
+    teeth, lip = template.neutral.regions["teeth_upper"], template.neutral.landmarks[62]
+    shift = torch.exp(-(((rest - rest[lip]).norm(dim=-1) / 25.0) ** 2))
+    head = rest * torch.tensor([wider, 1.0, 1.0]) + higher * shift[:, None] * torch.tensor([0.0, 1.0, 0.0])
+    head[parts.vertices] = rest[parts.vertices]
+    placed = place_parts(template, template.neutral.with_vertices(head), parts)
+    shown = [float((of[lip] - of[teeth])[:, 1].max()) for of in (rest, placed.vertices)]
+    assert shown[1] == pytest.approx(shown[0], abs=0.3)
+    bones = shape_depths(transfer_with_report(template, placed).rig, parts)[:, parts.hard]
+    assert float(bones.max()) <= TOLERANCE
 
 
 @pytest.mark.parametrize("pose", ["rest", "open"])

@@ -21,6 +21,8 @@ _MAX_ITERATIONS = 8
 _MAX_TOTAL_WEIGHT = 20.0  # of a registered skin, whose errors are neighbours' too
 # How far people's eyeballs are from where the skin around carries a template's: across, up and to the front.
 _TRANSLATION_DEVIATION = (0.5, 0.8, 1.0)
+_LIP_DEVIATION = 0.03  # of teeth in height, which an open mouth shows
+_MOUTH, _UPPER_LIP = 48, [62]  # of iBUG's landmarks: the first of the mouth, the middle of the edge over teeth
 _SCALE_DEVIATION = 0.03
 _FACING = 0.6
 _OUTLIER = 2.0
@@ -42,6 +44,8 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
         + \tau^T \Lambda \tau + \lambda_\sigma \sigma^2
 
     with the deviations that people show: lids that a registration has a millimetre off would else turn eyes inward.
+    Under the upper lip of iBUG's landmarks teeth show as much as in the template: people's lips are longer or shorter
+    than their heads' sizes say.
 
     Shells and lashes follow the nearest skin; shells keep the height over the eyeball that they have in the template.
     What is left of parts before the skin is cleared as in ``clear_parts``.
@@ -77,7 +81,7 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
         bones = parts.vertices[own & parts.hard]
         if len(bones) == 0:
             continue
-        fitted = _fitted(aligned, found, bones, parts)
+        fitted = _fitted(aligned, found, bones, parts, _lip_before(template.neutral, aligned, bones))
         placed[bones] = fitted.apply(aligned[None, bones])[0]
         shells = parts.vertices[own & ~parts.hard]
         middle = placed[bones].mean(0)
@@ -149,20 +153,33 @@ def _following(aligned: Tensor, found: Tensor, parts: InnerParts, body: Tensor) 
     return placed
 
 
-def _fitted(aligned: Tensor, found: Tensor, bones: Tensor, parts: InnerParts) -> Similarity:
+def _lip_before(template: Mesh, aligned: Tensor, bones: Tensor) -> Tensor | None:
+    """The vertex of the upper lip's edge, (1,), if bones lie nearer to the mouth than to other landmarks."""
+    marks = None if template.annotations is None else template.annotations.landmarks
+    if marks is None or len(marks) != 68:
+        return None
+    marks = marks.cpu()
+    beside = cKDTree(aligned[bones].numpy()).query(aligned[marks].numpy())[0].argmin()
+    return marks[_UPPER_LIP] if beside >= _MOUTH else None
+
+
+def _fitted(aligned: Tensor, found: Tensor, bones: Tensor, parts: InnerParts, lip: Tensor | None) -> Similarity:
     """The similarity that takes a group's hard parts from where the template aligned with the head has them."""
     middle = aligned[bones].mean(0)
     wanted = _SkinBefore.of(aligned, parts.skin, middle, aligned[bones])
     thin = wanted.thickness[wanted.met].clamp(min=0)
     use = wanted.met & (wanted.thickness < (float(thin.quantile(_THIN)) if len(thin) else 0.0) + _THICKER)
     around = parts.skin[wanted.triangle[use]].unique()
-    if len(around) < _MIN_VERTICES:
+    across, up, front = _TRANSLATION_DEVIATION
+    if lip is not None:
+        around, up = lip, _LIP_DEVIATION
+    elif len(around) < _MIN_VERTICES:
         around = parts.skin.unique()
     # Lids show little of an eyeball's size and nothing of its rotation: both are the whole head's.
     centre = middle + (found - aligned)[around].mean(0)
     offsets = aligned[bones[use]] - middle
     state = torch.zeros(4, dtype=torch.float64)
-    prior = 1 / torch.tensor([*_TRANSLATION_DEVIATION, _SCALE_DEVIATION], dtype=torch.float64).square()
+    prior = 1 / torch.tensor([across, up, front, _SCALE_DEVIATION], dtype=torch.float64).square()
     for _ in range(_MAX_ITERATIONS if bool(use.any()) else 0):
         now = centre + state[:3] + (1 + state[3]) * offsets
         have = _SkinBefore.of(found, parts.skin, centre + state[:3], now)
