@@ -29,8 +29,7 @@ ROUNDING = 1e-9
 
 WRITTEN = (
     "ProjectedGradient", "WebcamSolver", "SolverGraph", "SolverGraph with predictions", "DynamicsPrior", "HeadModel",
-    "ExpressionRegression", "WrinkleWeights", "ActionUnitClassifier", "LandmarkNetwork", "EyeNetwork",
-    "BoxNetwork",
+    "ExpressionRegression", "ActionUnitClassifier", "LandmarkNetwork", "EyeNetwork", "BoxNetwork",
 )  # fmt: skip
 """Exported in the tests and benches of their ONNX graphs, which is more."""
 

@@ -49,6 +49,7 @@ def run(path: Path, inputs: Tensor) -> Tensor:
     return torch.from_numpy(found[0])
 
 
+@pytest.mark.bench  # tests/modules exports the module to a graph of PyTorch's
 def test_the_graph_of_vertices_is_the_module(
     rig: BlendshapeRig, learned: WrinkleWeights, poses: Tensor, tmp_path: Path
 ) -> None:

@@ -149,7 +149,7 @@ def test_a_prepared_h_gives_the_same_in_any_batch() -> None:
 
 
 @pytest.mark.parametrize("each", [False, True])
-@pytest.mark.parametrize(("lower", "upper"), [(0.0, 1.0), (0.0, INF)])
+@pytest.mark.parametrize(("lower", "upper"), [(0.0, 1.0), pytest.param(0.0, INF, marks=pytest.mark.bench)])
 def test_derivatives_with_bounds_active(each: bool, lower: float, upper: float) -> None:
     H = hessian(6, 0.5, 20.0)
     if each:

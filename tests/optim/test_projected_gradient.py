@@ -163,6 +163,7 @@ def test_onnx_runtime_computes_the_same_in_a_loop(tmp_path: Path, own: bool) -> 
         np.testing.assert_allclose(found, module(*some).numpy(), atol=3e-6)
 
 
+@pytest.mark.bench  # as the one above
 def test_a_network_that_learns_is_written_as_it_is(tmp_path: Path) -> None:
     network = nn.Sequential(nn.Linear(3, 5), ProjectedGradient(hessians(size=5).float(), steps=50)).eval()
     features = torch.randn(4, 3, generator=torch.Generator().manual_seed(0))
