@@ -41,7 +41,14 @@ LONG = (
 
 IN_ONE_GRAPH = [name for name, example in EXAMPLES.items() if "torch.compile" not in example.cells]
 
-every_class = pytest.mark.parametrize("name", EXAMPLES)
+# Everyday the marker solver shows what correctives change; the other takes as long as six classes.
+every_class = pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=pytest.mark.bench if name == "HybridSolver with correctives" else ())
+        for name in EXAMPLES
+    ],
+)
 
 
 def outputs(example: Example, module: Any, *inputs: Tensor) -> list[Tensor]:

@@ -27,6 +27,7 @@ from torchface.synthetic import character, draw_identities, performer
 from torchface.workflows.track import person_head as module
 from torchface.workflows.track.person_head import HeadFrames, person_head
 from torchface.workflows.track.track_inputs import TrackSettings, load_inputs
+from torchface.workflows.track.track_result import Tracked
 from torchface.workflows.track.track_video import track_video
 
 COUNT, WIDTH, HEIGHT, SIDE = 12, 640, 480, 360
@@ -60,11 +61,23 @@ def take(actor: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> tupl
     return folder / "take.csv", weights
 
 
-def test_the_head_is_solved_with_the_take(actor: BlendshapeRig, take: tuple[Path, Tensor], tmp_path: Path) -> None:
-    table, weights = take
-    settings = TrackSettings(landmarks=table, size=(WIDTH, HEIGHT), heads="head")
-    tracked = track_video(None, None, tmp_path / "out", settings)
-    made, mean = load_rig(tmp_path / "out" / "head.glb"), performer(texture=False)
+@pytest.fixture(scope="module")
+def settings(take: tuple[Path, Tensor]) -> TrackSettings:
+    return TrackSettings(landmarks=take[0], size=(WIDTH, HEIGHT), heads="head")
+
+
+@pytest.fixture(scope="module")
+def solved(settings: TrackSettings, tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Tracked]:
+    """A folder and what was written into it."""
+    out = tmp_path_factory.mktemp("solved") / "out"
+    return out, track_video(None, None, out, settings)
+
+
+def test_the_head_is_solved_with_the_take(
+    actor: BlendshapeRig, settings: TrackSettings, solved: tuple[Path, Tracked], tmp_path: Path
+) -> None:
+    out, tracked = solved
+    made, mean = load_rig(out / "head.glb"), performer(texture=False)
     assert made.names == actor.names
     skin = actor.neutral.annotations.regions["face"]
     true = actor.vertices[skin]
@@ -76,22 +89,33 @@ def test_the_head_is_solved_with_the_take(actor: BlendshapeRig, take: tuple[Path
     ):
         inner = posed.vertices[mean.neutral.landmarks[36:48]].double()
         assert float((camera.project(inner) - seen[36:48]).norm(dim=1).max()) < 3  # pixels: cameras went along
-    assert tracked.products["head"] == tmp_path / "out" / "head.glb"
-    animation = (tmp_path / "out" / "animation.glb").read_bytes()
+    assert tracked.products["head"] == out / "head.glb"
+    animation = (out / "animation.glb").read_bytes()
     assert re.search(rb'"path": ?"rotation"', animation)  # the head turns
     assert any(line.startswith("head: solved from") for line in tracked.lines())
-    save_rig(mean, tmp_path / "mean.glb")
+    # Another take goes on with both files.
+    known = replace(settings, offsets=out / "landmark_offsets.json")
+    other = track_video(None, out / "head.glb", tmp_path / "other", known)
+    assert torch.equal(other.offsets.millimetres, tracked.offsets.millimetres)
+    assert "head" not in other.products
+
+
+@pytest.mark.bench  # the take is solved again
+def test_the_weights_on_the_solved_head_are_nearer_than_those_on_the_mean_head(
+    actor: BlendshapeRig,
+    take: tuple[Path, Tensor],
+    settings: TrackSettings,
+    solved: tuple[Path, Tracked],
+    tmp_path: Path,
+) -> None:
+    save_rig(performer(texture=False), tmp_path / "mean.glb")
     strangers = track_video(None, tmp_path / "mean.glb", tmp_path / "strangers", settings)
     columns = actor.index(SHAPES)
     ours, theirs = (
-        float((one.solution.weights - weights)[:, columns].square().mean().sqrt()) for one in (tracked, strangers)
+        float((one.solution.weights - take[1])[:, columns].square().mean().sqrt()) for one in (solved[1], strangers)
     )
     assert ours < theirs
     assert "head" not in strangers.products
-    # Another take goes on with both files.
-    known = replace(settings, offsets=tmp_path / "out" / "landmark_offsets.json")
-    other = track_video(None, tmp_path / "out" / "head.glb", tmp_path / "other", known)
-    assert torch.equal(other.offsets.millimetres, tracked.offsets.millimetres)
 
 
 def test_a_rig_of_another_topology_is_refused(
