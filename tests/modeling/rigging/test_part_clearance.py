@@ -199,6 +199,22 @@ def test_teeth_show_under_a_longer_or_shorter_upper_lip_as_in_the_template(highe
     assert float(bones.max()) <= TOLERANCE
 
 
+@pytest.mark.parametrize(("opened", "left"), [(0.4, 0.0), (3.0, 3.0)])
+def test_lips_that_a_registration_left_ajar_meet_and_parted_ones_stay_parted(opened: float, left: float) -> None:
+    """The slit of a real scan's rig was 0.25 mm wide, and teeth shone through."""
+    rig = performer(texture=False)
+    upper, lower = rig.neutral.landmarks[62], rig.neutral.landmarks[66]
+    jaw = rig.deltas[rig.names.index("jawOpen")]
+    found = rig.vertices + (opened - 0.12) / float((jaw[upper] - jaw[lower])[1]) * jaw
+    pose = Similarity(torch.ones(1).double(), torch.eye(3)[None].double(), torch.zeros(1, 3).double())
+    seen = torch.ones(len(found), dtype=torch.bool)
+    registration = Registration(rig.neutral.with_vertices(found), pose, seen.double(), seen, None)
+    placed = with_placed_parts(rig.select([]), registration).mesh.vertices
+    assert float((placed[upper] - placed[lower])[1]) == pytest.approx(left, abs=1e-3)
+    moved = (placed - found).norm(dim=1)[rig.neutral.regions["upper_lip"] | rig.neutral.regions["lower_lip"]]
+    assert float(moved.max()) <= (0.0 if left else 0.3)
+
+
 @pytest.mark.parametrize("pose", ["rest", "open"])
 def test_a_mouth_that_came_through_the_chin_lies_behind_it_again(pose: str) -> None:
     rig = performer(texture=False)

@@ -30,6 +30,7 @@ _HOSTS = 8
 _MAX_RISE, _MAX_DROP = 1.0, 0.2
 _NOTHING = 1e-3
 _BEHIND_SKIN, _SPREAD = 0.5, 8  # millimetres, rings of vertices
+_TOUCHING, _AJAR = 0.2, 0.7  # millimetres between lips that are shut: in a template, after its registration
 
 
 def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Mesh:
@@ -97,16 +98,29 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
 
 def with_placed_parts(rig: BlendshapeRig, registration: Registration) -> Registration:
     """A registration whose eyeballs and teeth are where ``place_parts`` has them, and round, in place of bent ones,
-    whose mouth lies behind the skin, and whose hidden parts have the template's colours."""
+    whose lips meet and mouth lies behind the skin, and whose hidden parts have the template's colours."""
     template, parts = rig.neutral, inner_parts(rig)
     upright = registration.pose.inverse().apply(registration.mesh.vertices.detach().cpu().double())[0]
     bent = template.with_vertices(upright.to(template.vertices))
-    placed = with_mouth_behind_skin(place_parts(rig, bent, parts) if len(parts.vertices) else bent)
+    met = with_met_lips(bent, template)
+    placed = with_mouth_behind_skin(place_parts(rig, met, parts) if len(parts.vertices) else met)
     mesh = registration.mesh
     if placed is not bent:
         vertices = registration.pose.apply(placed.vertices.detach().cpu().double())[0]
         mesh = mesh.with_vertices(vertices.to(mesh.vertices))
     return replace(registration, mesh=with_template_skin(mesh, template, hidden_parts(template, registration.matched)))
+
+
+def with_met_lips(head: Mesh, template: Mesh) -> Mesh:
+    """A head with no slit between lips that touch in its template, where a registration left them ajar."""
+    pairs = None if template.annotations is None else template.annotations.contacts
+    if pairs is None:
+        return head
+    first, second = ((mesh.vertices[pairs[:, 0]] - mesh.vertices[pairs[:, 1]]).norm(dim=1) for mesh in (template, head))
+    met = pairs[(first < _TOUCHING) & (second < _AJAR)]
+    vertices = head.vertices.clone()
+    vertices[met] = vertices[met].mean(1, keepdim=True)
+    return head.with_vertices(vertices)
 
 
 def with_mouth_behind_skin(head: Mesh) -> Mesh:
