@@ -17,6 +17,7 @@ from torchface.modeling.rigging.part_placement import with_mouth_behind_skin, wi
 from torchface.modeling.rigging.penetration import TOLERANCE
 from torchface.modeling.rigging.transfer_system import ShapeTransfer
 from torchface.registration import Registration
+from torchface.registration.scan_colors import own_colors
 from torchface.rendering.raycast import RayCaster
 from torchface.synthetic import IDENTITY, performer
 from torchface.synthetic.head.embedded_character import character
@@ -197,6 +198,23 @@ def test_teeth_show_under_a_longer_or_shorter_upper_lip_as_in_the_template(highe
     assert shown[1] == pytest.approx(shown[0], abs=0.3)
     bones = shape_depths(transfer_with_report(template, placed).rig, parts)[:, parts.hard]
     assert float(bones.max()) <= TOLERANCE
+
+
+@pytest.mark.parametrize(
+    ("skin", "whites", "found"), [(1.0, 1.0, 1.0), (0.65, 0.4, 0.75), (0.7, 0.85, 0.85), (0.3, 1.0, 1.0)]
+)
+def test_eyes_that_a_scan_hardly_shows_are_as_bright_as_its_light(skin: float, whites: float, found: float) -> None:
+    """Of a dim scan and of a dark complexion: whites 1.45 times as bright as skin glowed in a real scan's rig."""
+    rig = performer().select([])
+    colors, ball = own_colors(rig.neutral), rig.neutral.regions["eyeball_left"] | rig.neutral.regions["eyeball_right"]
+    template = replace(rig.neutral, colors=colors, texture=None)
+    pose = Similarity(torch.ones(1).double(), torch.eye(3)[None].double(), torch.zeros(1, 3).double())
+    seen = ~ball | (rig.vertices[:, 2] > 73)
+    scanned = replace(template, colors=torch.where(ball[:, None], whites, skin) * colors)
+    registration = Registration(scanned, pose, seen.double(), seen, None)
+    placed = with_placed_parts(BlendshapeRig(template, rig.deltas, rig.names), registration).mesh.colors
+    torch.testing.assert_close(placed[ball], found * colors[ball], rtol=1e-3, atol=1e-3)
+    torch.testing.assert_close(placed[~ball], scanned.colors[~ball])
 
 
 @pytest.mark.parametrize(("opened", "left"), [(0.4, 0.0), (3.0, 3.0)])

@@ -12,7 +12,9 @@ from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh
 from torchface.modeling.rigging.part_clearance import Clearance
 from torchface.modeling.rigging.penetration import InnerParts, inner_parts
+from torchface.part_materials import EYEBALL, part_material
 from torchface.registration import Registration, hidden_parts, with_template_skin
+from torchface.registration.scan_colors import own_colors
 from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 
@@ -30,6 +32,7 @@ _HOSTS = 8
 _MAX_RISE, _MAX_DROP = 1.0, 0.2
 _NOTHING = 1e-3
 _BEHIND_SKIN, _SPREAD = 0.5, 8  # millimetres, rings of vertices
+_WHITES, _DARKEST = 0.95, 0.75  # which quantile of an eye's colours is white; of whites and teeth beside the template's
 _TOUCHING, _AJAR = 0.2, 0.7  # millimetres between lips that are shut: in a template, after its registration
 
 
@@ -98,7 +101,8 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
 
 def with_placed_parts(rig: BlendshapeRig, registration: Registration) -> Registration:
     """A registration whose eyeballs and teeth are where ``place_parts`` has them, and round, in place of bent ones,
-    whose lips meet and mouth lies behind the skin, and whose hidden parts have the template's colours."""
+    whose lips meet and mouth lies behind the skin, and whose hidden parts have the template's colours, eyes and teeth
+    in the scan's light."""
     template, parts = rig.neutral, inner_parts(rig)
     upright = registration.pose.inverse().apply(registration.mesh.vertices.detach().cpu().double())[0]
     bent = template.with_vertices(upright.to(template.vertices))
@@ -108,7 +112,31 @@ def with_placed_parts(rig: BlendshapeRig, registration: Registration) -> Registr
     if placed is not bent:
         vertices = registration.pose.apply(placed.vertices.detach().cpu().double())[0]
         mesh = mesh.with_vertices(vertices.to(mesh.vertices))
-    return replace(registration, mesh=with_template_skin(mesh, template, hidden_parts(template, registration.matched)))
+    hidden, inner = hidden_parts(template, registration.matched), torch.zeros(len(template.vertices), dtype=torch.bool)
+    inner[parts.vertices] = True
+    light = _scan_light(registration, template).to(template.vertices)
+    shaded = replace(
+        template,
+        colors=None if template.colors is None else (light * template.colors).clamp(0, 1),
+        texture=None if template.texture is None else (light[:, None, None] * template.texture[:3]).clamp(0, 1),
+    )
+    mesh = with_template_skin(with_template_skin(mesh, template, hidden & ~inner), shaded, hidden & inner)
+    return replace(registration, mesh=mesh)
+
+
+def _scan_light(registration: Registration, template: Mesh) -> Tensor:
+    """The whites of eyes that a scan shows beside the template's, (3,), at most as bright: scans are often dim, and
+    what they do not show of a head would glow beside their skin. Lids shade whites, and skin beside them tints them:
+    they are not far darker, no darker than skin, and have half the hue."""
+    found, own, matched = registration.mesh.colors, own_colors(template), registration.matched.cpu()
+    balls = [mask.cpu() & matched for name, mask in template.regions.items() if part_material(name) is EYEBALL]
+    eyes = torch.stack(balls).any(0) if balls else matched & False
+    if found is None or own is None or int(eyes.sum()) < _MIN_VERTICES:
+        return torch.ones(3)
+    found = found.cpu()
+    seen, usual = (colors[eyes].quantile(_WHITES, dim=0) for colors in (found, own))
+    light, skin = (seen / usual).clamp(min=0.1), found[matched & ~eyes].median(0).values.mean() / usual.mean()
+    return torch.maximum(light.mean(), skin).clamp(_DARKEST, 1) * (light / light.mean()).sqrt()
 
 
 def with_met_lips(head: Mesh, template: Mesh) -> Mesh:
