@@ -45,6 +45,7 @@ def float_format(request: pytest.FixtureRequest) -> Iterator[torch.dtype]:
 LONG = (
     "torchface.capture.action_units.classifier",
     "torchface.modeling.rigging.other_topology",
+    "torchface.onnx.model_export",
     "torchface.onnx.module_graph",
     "torchface.synthetic.stages.wrinkles.wrinkled_performer",
 )

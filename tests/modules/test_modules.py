@@ -29,7 +29,7 @@ ROUNDING = 1e-9
 
 WRITTEN = (
     "ProjectedGradient", "WebcamSolver", "SolverGraph", "SolverGraph with predictions", "DynamicsPrior", "HeadModel",
-    "ExpressionRegression", "ActionUnitClassifier", "LandmarkNetwork", "EyeNetwork", "BoxNetwork",
+    "LandmarkNetwork", "BoxNetwork",
 )  # fmt: skip
 """Exported in the tests and benches of their ONNX graphs, which is more."""
 

@@ -100,6 +100,7 @@ def exported_by_command(model: nn.Module, folder: Path, capsys: pytest.CaptureFi
     return out
 
 
+@pytest.mark.bench  # tests/modules exports the module to a graph of PyTorch's
 def test_offsets_come_with_any_pose(
     regression: ExpressionRegression, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

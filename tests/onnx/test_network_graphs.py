@@ -56,6 +56,7 @@ def test_the_landmark_network_of_the_zoo(tmp_path: Path, monkeypatch: pytest.Mon
     assert report.parity["point_deviation"] < 0.02
 
 
+@pytest.mark.bench  # tests/modules exports the module to a graph of PyTorch's
 def test_eyes_in_a_small_file(tmp_path: Path) -> None:
     torch.manual_seed(0)
     network = EyeNetwork()

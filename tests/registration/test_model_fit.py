@@ -91,6 +91,7 @@ def test_models_of_something_else_are_refused(mask: Mesh, waves: Waves, make_mas
 
 
 @pytest.mark.usefixtures("coarse_figures")
+@pytest.mark.bench  # the command starts from a model in tests/cli/test_register.py
 def test_a_corpus_starts_from_the_model_too(mask: Mesh, waves: Waves, rescanned: Callable, tmp_path: Path) -> None:
     short = Schedule((Stage(Level.GRAPH, 8.0, 8.0, 20.0, samples=300), Stage(Level.GRAPH, 0.5, 1.0, 8.0)), nodes=30)
     (tmp_path / "scans").mkdir()

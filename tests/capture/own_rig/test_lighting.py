@@ -79,6 +79,7 @@ def check(fit: LightFit, light: PointLight, centre: Tensor) -> None:
     assert apart(fit.light.ambient, light.ambient) < 0.05
 
 
+@pytest.mark.bench  # a light from afar is found, and one of a file
 def test_planted_lights_come_back(rig: BlendshapeRig) -> None:
     generator = torch.Generator().manual_seed(0)
     cameras, weights = turning_cameras(rig, 400, 20.0, generator, STAGE), performed(rig, 400, generator)

@@ -113,6 +113,7 @@ def test_the_face_is_relit_and_the_hand_before_it_is_not(filmed: Filmed, tmp_pat
         assert float(beside.mean()) > 4  # the cheek behind it is relit
 
 
+@pytest.mark.bench  # test_texture_overlay.py relights with lights that are known
 def test_a_film_in_its_own_light_is_the_film_and_others_are_as_bright(filmed: Filmed) -> None:
     """On the face: off by 1 % of full brightness in the mean; other lights are as bright on a ball."""
     read, t = read_tracked_film(filmed.film, filmed.track), 1

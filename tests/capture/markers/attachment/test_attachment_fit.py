@@ -41,6 +41,7 @@ def error_with(rig: BlendshapeRig, sites: Attachment, take: Take, true: Tensor) 
     return float((solved.weights.values[..., 0] - true).abs().mean())
 
 
+@pytest.mark.bench  # a calm take of the performer gives its sites everyday
 def test_sites_on_the_performer_come_back(performance: Performance, stage_space: Similarity) -> None:
     rig, attachment, takes = performance
     performance = (rig, attachment, [takes[0][::10], takes[1][::10]])
