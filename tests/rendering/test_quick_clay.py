@@ -47,7 +47,7 @@ def test_irises_have_the_colour_of_a_texture_that_shows_some() -> None:
     eye = head.vertices[head.landmarks[36:42]].mean(0).double()
     camera = Camera(intrinsics, flip, torch.tensor([0.0, 0, 400]).double() - flip @ eye, 320, 320)
     for look in (Look(iris=(0.2, 0.3, 0.6)), Look(iris=(0.4, 0.25, 0.1))):
-        shown = character(look=look, size=512).rig.neutral
+        shown = character(look=look, size=256).rig.neutral
         drawn = QuickClay.of(shown, skin=True).draw(shown.vertices, camera).astype(float)
         ring = drawn[[160, 160, 160], [142, 178, 182]].mean(0)  # between pupil and white
         assert (ring[2] > 1.2 * ring[0]) == (look.iris[2] > look.iris[0])
