@@ -70,6 +70,7 @@ def test_a_mesh_registered_to_a_moved_copy_is_the_copy(mask: Mesh, moved, seed: 
     assert float(result.pose.scale[0]) == pytest.approx(scale, abs=1e-3)
 
 
+@pytest.mark.bench  # the mesh itself and a real head are found everyday
 def test_without_landmarks_the_copy_is_found_too(mask: Mesh, moved) -> None:
     copy = mask.with_vertices(moved(mask.vertices, 3, 1.1))
     result = register(mask, copy)
@@ -103,6 +104,7 @@ def test_a_planted_deformation_is_recovered(mask: Mesh, truth: Tensor, registere
     )
 
 
+@pytest.mark.bench  # a peer
 def test_the_full_system_of_the_paper_comes_to_the_same(
     mask: Mesh, scan: Mesh, landmarks: Landmarks, truth: Tensor, registered: Registration
 ) -> None:

@@ -18,6 +18,7 @@ from torchface.temporal.interpolation import values_at
 Performance = tuple[BlendshapeRig, Attachment, list[Tensor]]
 
 
+@pytest.mark.bench  # the demo's test compares both solves
 def test_errors_on_the_performer_are_smaller(performance: Performance) -> None:
     rig, attachment, takes = performance
     true = takes[0][:700]

@@ -182,6 +182,7 @@ def test_pictures_of_different_expressions_give_one_head(rig: BlendshapeRig, mod
     assert sum(together) < 0.8 * sum(apart)
 
 
+@pytest.mark.bench
 def test_more_pictures_give_a_better_head(rig: BlendshapeRig, model: HeadModel) -> None:
     skin, errors = model.annotations.regions["face"], torch.zeros(4)
     poses = [(0.0, LAUGH), (35.0, POUT), (-40.0, {}), (10.0, EXPRESSION)]

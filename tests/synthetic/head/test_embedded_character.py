@@ -71,7 +71,7 @@ def test_lower_teeth_go_rigidly_with_the_jaw_and_upper_ones_stay(shown) -> None:
     assert (opened[lower][front, 1] < rig.vertices[lower][front, 1] - 20).all()
 
 
-@pytest.mark.parametrize("person", [None, 1, 4])
+@pytest.mark.parametrize("person", [None, pytest.param(1, marks=pytest.mark.bench), 4])
 def test_no_part_comes_through_the_skin_in_any_shape_or_common_pair(shown, person) -> None:
     rig = shown.rig
     if person is not None:
