@@ -113,6 +113,18 @@ def test_the_face_is_relit_and_the_hand_before_it_is_not(filmed: Filmed, tmp_pat
         assert float(beside.mean()) > 4  # the cheek behind it is relit
 
 
+def test_other_lights_are_as_bright_on_a_ball_and_its_own_is_the_same() -> None:
+    for azimuth in (-60, 0, 60):
+        light = WantedLight.parse([f"azimuth={azimuth}", "ambient=0.2"]).beside(LAMP)
+        torch.testing.assert_close(light.on_front(), LAMP.on_front())
+    around, up, share = _angles(LAMP)
+    same = WantedLight.parse([f"azimuth={around:.2f}", f"elevation={up:.2f}", f"ambient={share:.4f}"]).beside(LAMP)
+    for name in ("ambient", "intensity"):
+        torch.testing.assert_close(getattr(same, name), getattr(LAMP, name), rtol=0.01, atol=0)
+    toward, own = (one.toward(torch.zeros(3)) for one in (same, LAMP))
+    torch.testing.assert_close(toward, own, rtol=0, atol=0.001, check_dtype=False)
+
+
 @pytest.mark.bench  # test_texture_overlay.py relights with lights that are known
 def test_a_film_in_its_own_light_is_the_film_and_others_are_as_bright(filmed: Filmed) -> None:
     """On the face: off by 1 % of full brightness in the mean; other lights are as bright on a ball."""
