@@ -16,6 +16,7 @@ from torchface.mesh import Mesh
 from torchface.modeling import HeadModel, MorphableModel
 from torchface.registration import Level, Schedule, Stage, load_scan_landmarks, register
 from torchface.registration.model_fit import LinearShape, shape_model
+from torchface.workflows.batch.batch_items import BatchItem
 from torchface.workflows.register.register_scans import ScanSettings, register_scans
 from torchface.workflows.register.scan_job import ScanJob
 
@@ -91,6 +92,19 @@ def test_models_of_something_else_are_refused(mask: Mesh, waves: Waves, make_mas
 
 
 @pytest.mark.usefixtures("coarse_figures")
+def test_another_model_makes_results_anew_and_goes_to_other_processes(mask: Mesh, waves: Waves, tmp_path: Path) -> None:
+    item = BatchItem("scan", tmp_path / "scan.ply")
+    save_mesh(mask, item.path)
+    job, other = (
+        ScanJob(mask, Schedule((Stage(Level.GRAPH, 8.0, 8.0, 20.0),)), 0, model=LinearShape.of(one))
+        for one in (waves, Waves(waves.mean, 1.1 * waves.modes))
+    )
+    assert job.key(item) != other.key(item)
+    sent = pickle.loads(pickle.dumps(job))
+    assert torch.equal(sent.model.modes, waves.modes.float())
+    assert sent.key(item) == job.key(item)
+
+
 @pytest.mark.bench  # the command starts from a model in tests/cli/test_register.py
 def test_a_corpus_starts_from_the_model_too(mask: Mesh, waves: Waves, rescanned: Callable, tmp_path: Path) -> None:
     short = Schedule((Stage(Level.GRAPH, 8.0, 8.0, 20.0, samples=300), Stage(Level.GRAPH, 0.5, 1.0, 8.0)), nodes=30)
@@ -103,8 +117,6 @@ def test_a_corpus_starts_from_the_model_too(mask: Mesh, waves: Waves, rescanned:
     settings = {"landmarks": tmp_path / "scans", "schedule": short, "texture_size": 0}
     done = register_scans(mask, [tmp_path / "scans"], tmp_path / "out", ScanSettings(model=waves, **settings))
     assert len(done.done) == 2
-    sent = pickle.loads(pickle.dumps(ScanJob(mask, short, 0, model=LinearShape.of(waves))))
-    assert torch.equal(sent.model.modes, waves.modes.float())
     for entry in done.done:
         marks = load_scan_landmarks(tmp_path / "scans" / f"{entry.name}.ljson", mask, entry.item.path)
         alone = register(mask, load_mesh(entry.item.path), marks, model=LinearShape.of(waves), schedule=short)
