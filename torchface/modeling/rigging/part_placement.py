@@ -127,7 +127,7 @@ def with_placed_parts(rig: BlendshapeRig, registration: Registration) -> Registr
 def _scan_light(registration: Registration, template: Mesh) -> Tensor:
     """The whites of eyes that a scan shows beside the template's, (3,), at most as bright: scans are often dim, and
     what they do not show of a head would glow beside their skin. Lids shade whites, and skin beside them tints them:
-    they are not far darker, no darker than skin, and have half the hue."""
+    they are not far darker, no darker than skin, and have a third of the hue."""
     found, own, matched = registration.mesh.colors, own_colors(template), registration.matched.cpu()
     balls = [mask.cpu() & matched for name, mask in template.regions.items() if part_material(name) is EYEBALL]
     eyes = torch.stack(balls).any(0) if balls else matched & False
@@ -136,7 +136,7 @@ def _scan_light(registration: Registration, template: Mesh) -> Tensor:
     found = found.cpu()
     seen, usual = (colors[eyes].quantile(_WHITES, dim=0) for colors in (found, own))
     light, skin = (seen / usual).clamp(min=0.1), found[matched & ~eyes].median(0).values.mean() / usual.mean()
-    return torch.maximum(light.mean(), skin).clamp(_DARKEST, 1) * (light / light.mean()).sqrt()
+    return torch.maximum(light.mean(), skin).clamp(_DARKEST, 1) * (light / light.mean()) ** (1 / 3)
 
 
 def with_met_lips(head: Mesh, template: Mesh) -> Mesh:
