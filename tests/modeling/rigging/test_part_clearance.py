@@ -13,6 +13,7 @@ from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.io import load_ict_facekit, load_identity_modes
 from torchface.modeling import InnerParts, clear_parts, inner_parts, place_parts, shape_depths, transfer_with_report
+from torchface.modeling.rigging.part_clearance import penetration
 from torchface.modeling.rigging.part_placement import with_mouth_behind_skin, with_placed_parts
 from torchface.modeling.rigging.penetration import TOLERANCE
 from torchface.modeling.rigging.transfer_system import ShapeTransfer
@@ -215,6 +216,17 @@ def test_eyes_that_a_scan_hardly_shows_are_as_bright_as_its_light(skin: float, w
     placed = with_placed_parts(BlendshapeRig(template, rig.deltas, rig.names), registration).mesh.colors
     torch.testing.assert_close(placed[ball], found * colors[ball], rtol=1e-3, atol=1e-3)
     torch.testing.assert_close(placed[~ball], scanned.colors[~ball])
+
+
+def test_a_tongue_that_is_put_out_pushes_no_lip_before_it() -> None:
+    """On a real scan's head it drew the lower lip out by 23 mm, and was reported as standing out of the skin."""
+    rig = character(size=64).rig.select(["jawOpen", "tongueOut"])
+    parts = inner_parts(rig)
+    assert float(shape_depths(rig, parts)[2].max()) > 1
+    assert torch.equal(clear_parts(rig, parts).deltas[1], rig.deltas[1])
+    found = penetration(rig, parts)
+    assert found is not None
+    assert "tongueOut" not in found.poses
 
 
 @pytest.mark.parametrize(("opened", "left"), [(0.4, 0.0), (3.0, 3.0)])

@@ -96,6 +96,8 @@ def _cleared(deltas: Tensor, moving: Tensor, poses: Tensor, clearance: "Clearanc
 def clearance_poses(rig: BlendshapeRig, parts: InnerParts) -> Tensor:
     """Every shape at weight 1, then random mixtures of three of those that move the skin before each small group.
 
+    A tongue that is put out belongs before the skin: ``tongueOut`` is no pose to clear.
+
     Groups are independent: one pose mixes shapes for all of them. The largest group, the mouth, is left out:
     lips part where they are mixed, and so many of them do that no few mixtures stand for all.
 
@@ -124,7 +126,12 @@ def clearance_poses(rig: BlendshapeRig, parts: InnerParts) -> Tensor:
             drawn = movers[torch.cat([torch.zeros(1 - number % 2, dtype=torch.int64), others])[:_MIXED]]
             strength = torch.rand(len(drawn), generator=generator, dtype=torch.float64)
             row[drawn] = _MIN_WEIGHT + (_MAX_WEIGHT - _MIN_WEIGHT) * strength
-    return torch.cat([torch.eye(count, dtype=torch.float64), mixed[mixed.any(1)]])
+    return torch.cat([torch.eye(count, dtype=torch.float64)[~_put_out(rig)], mixed[mixed.any(1)]])
+
+
+def _put_out(rig: BlendshapeRig) -> Tensor:
+    """The shapes that put the tongue out, (N,) bool."""
+    return mapping(rig.names, ["tongueOut"])[0] > 0.5
 
 
 class Clearance:
@@ -208,10 +215,11 @@ class Penetration:
 
 
 def penetration(rig: BlendshapeRig, parts: InnerParts) -> Penetration | None:
-    """The penetration of a rig; None where the head has no parts inside."""
+    """The penetration of a rig, a tongue put out aside; None where the head has no parts inside."""
     if len(parts.vertices) == 0:
         return None
     depths = shape_depths(rig, parts)
+    depths[1:][_put_out(rig)] = 0
     poses = ("rest", *rig.names)
     deepest, out = depths.amax(1), (depths > TOLERANCE).sum(1)
     worst = int(deepest.argmax())
