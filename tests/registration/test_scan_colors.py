@@ -9,7 +9,7 @@ from torch import Tensor
 from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.mesh import Mesh
 from torchface.registration import register, with_template_skin
-from torchface.registration.scan_colors import skin_base, with_edge_of_hair
+from torchface.registration.scan_colors import ScanColors, own_colors, resampled_texture, skin_base, with_edge_of_hair
 
 
 def paint(points: Tensor) -> Tensor:
@@ -132,6 +132,17 @@ def test_what_is_unseen_has_the_templates_texture_in_the_tone_of_the_skin_alone(
     base = skin_base(colors, template, seen)
     assert float((base[:count][~place[:count]] - 0.6).abs().max()) < 0.01
     assert float((base[place] - 0.15).abs().max()) < 0.01
+
+
+def test_what_is_unseen_has_what_the_templates_texture_shows_between_vertices(mask: Mesh, textured: Mesh) -> None:
+    """From vertices alone a hairline came out as a blurred block of sideburn."""
+    stripes = 0.4 + 0.2 * (torch.arange(256) // 4 % 2).float().expand(3, 256, 256)
+    template = replace(mask, texture=stripes)
+    source = ScanColors(textured, textured.vertices.double(), textured.faces, torch.arange(len(textured.faces)))
+    darker = 0.5 * own_colors(template)
+    made = resampled_texture(mask, template, darker, torch.zeros(len(mask.vertices)), source, 256)
+    inside = rasterise_uvs(mask.uvs, mask.uv_faces, 256, 256).texels
+    torch.testing.assert_close(made.flatten(1)[:, inside], 0.5 * stripes.flatten(1)[:, inside], rtol=0, atol=0.02)
 
 
 def test_a_templates_texture_reaches_a_seam_beyond_the_hidden_part_to_all_sides() -> None:

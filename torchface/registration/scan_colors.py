@@ -20,6 +20,7 @@ from torchface.rendering.raycast import RayCaster
 _REACH = 5.0
 _BLEND = 10.0
 _MAX_ANGLE = 75.0
+_LEAST, _FINEST = 0.02, 5.0  # of a colour; times brighter or darker than between vertices
 _DARK = 0.25  # of the skin's light
 _STRANDS, _SHADOW = 3, 2  # rings of vertices
 
@@ -121,13 +122,15 @@ def with_edge_of_hair(unseen: Tensor, shown: Tensor, matched: Tensor, faces: Ten
     return covered | edge
 
 
-def resampled_texture(mesh: Mesh, colors: Tensor, shown: Tensor, source: ScanColors, size: int) -> Tensor:
+def resampled_texture(
+    mesh: Mesh, template: Mesh, colors: Tensor, shown: Tensor, source: ScanColors, size: int
+) -> Tensor:
     """A texture (3,size,size) in the mesh's own layout.
 
     From each texel's place on the registered mesh a ray goes out and one in along the normal; the nearer hit within
     5 mm whose surface faces the same way gives the colour. Where there is none, the vertex colours do, and they take
-    over where the scan does not show the skin. Charts are widened by four texels, so that no background shows at
-    their seams.
+    over where the scan does not show the skin, with what the template's texture has between vertices. Charts are
+    widened by four texels, so that no background shows at their seams.
     """
     if mesh.uvs is None or mesh.uv_faces is None:
         raise TopologyError("mesh: found no texture coordinates, expected some to lay a texture out in")
@@ -137,6 +140,12 @@ def resampled_texture(mesh: Mesh, colors: Tensor, shown: Tensor, source: ScanCol
     normals = torch.nn.functional.normalize(texels.interpolate(vertex_normals(vertices, faces), faces), dim=-1)
     values = texels.interpolate(colors.double(), faces).float()
     share = texels.interpolate(shown[:, None].double(), faces).float()
+    own = own_colors(replace(template, colors=None))
+    if own is not None and template.texture is not None:
+        places = texels.interpolate(mesh.uvs.cpu().double(), mesh.uv_faces.cpu())
+        fine = sample_texture(template.texture.cpu()[:3], places)
+        fine = fine / texels.interpolate(own.double(), faces).float().clamp(min=_LEAST)
+        values = values * torch.lerp(fine.clamp(1 / _FINEST, _FINEST), torch.ones_like(fine), share)
     wanted = (share[:, 0] > 0).nonzero()[:, 0]
     triangle, barycentric, hit = _along_normals(source, points[wanted], normals[wanted])
     rows = wanted[hit]

@@ -311,6 +311,6 @@ def _colored(
     # The last skin before hair is in its shadow: the fill starts where the scan's colours count in full.
     filled = completed_colors(colors, skin_base(colors, template, matched), place, faces, shown < 1)
     colors = torch.lerp(filled, colors, shown[:, None])
-    texture = resampled_texture(mesh, filled, shown, source, size) if size and mesh.uvs is not None else None
+    texture = resampled_texture(mesh, template, filled, shown, source, size) if size and mesh.uvs is not None else None
     device = mesh.vertices.device
     return replace(mesh, colors=colors.to(device), texture=None if texture is None else texture.to(device))
