@@ -265,12 +265,18 @@ def calmed(weights: Tensor, names: Sequence[str], fps: float) -> Tensor:
         >>> bool(calmed(noisy, ["jawOpen"], 30.0).diff(dim=0).std() < 0.5 * noisy.diff(dim=0).std())
         True
     """
-    window = 2 * round(0.5 * _CALM * fps) + 1
-    if not _LEAST_WINDOW <= window <= len(weights):
+    window = calm_window(fps, len(weights))
+    if window is None:
         return weights
     blinks = torch.tensor([name.startswith("eyeBlink") for name in arkit_names(names)], device=weights.device)
     calm = signed_difference(savitzky_golay(weights, window).clamp(0, 1), signed_quantities(names).to(weights.device))
     return torch.where(blinks, weights, calm)
+
+
+def calm_window(fps: float, count: int) -> int | None:
+    """How many frames a parabola goes through; None where a take has too few."""
+    window = 2 * round(0.5 * _CALM * fps) + 1
+    return window if _LEAST_WINDOW <= window <= count else None
 
 
 def keep_solution(state: TrackState, key: str, solution: VideoSolution) -> None:

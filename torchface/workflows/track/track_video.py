@@ -24,6 +24,7 @@ from torchface.workflows.fit.fitted_character import dressed_rig
 from torchface.workflows.fit.video_pictures import sharpness_of
 from torchface.workflows.named_finders import part_finder
 from torchface.workflows.track.camera_views import other_cameras
+from torchface.workflows.track.followed_skin import followed_weights
 from torchface.workflows.track.frame_readings import read_frames
 from torchface.workflows.track.overlay_video import write_overlay
 from torchface.workflows.track.person_head import HeadFrames, PersonHead, person_head
@@ -125,6 +126,9 @@ def track_video(
                 views = tuple(other.view(shown, out, solver, progress) for other in others)
                 measured = replace(measured or FaceMeasurements(), views=views)
             solution = new_solution(inputs, solver, landmarks, sure, times, progress, measured)
+        with _timed(seconds, "skin's motion"):
+            weights, pose = followed_weights(inputs, solution, progress), (solution.rotation, solution.translation)
+            solution = solver.solution(landmarks, sure, weights, *pose, measured)
         keep_solution(state, key, solution)
     tracked = Tracked(
         inputs,

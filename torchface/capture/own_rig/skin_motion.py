@@ -1,0 +1,311 @@
+"""How skin moves beside a take's solution: the face of every frame, laid flat, beside that of all frames together.
+
+Landmarks of a face are found by networks, which shrink what they have not learned; skin that was filmed is its own
+reference. Where weights and pose are right, a rig's places show the same skin in all frames, so what the skin is off
+by, from frame to frame, is what the weights are.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from tempfile import TemporaryFile
+
+import cv2
+import numpy as np
+import torch
+from torch import Tensor
+
+from torchface.capture.own_rig.eye_geometry import arkit_names
+from torchface.geometry.cameras.calibration import CameraCalibration
+from torchface.geometry.cameras.distortion import distort
+from torchface.geometry.meshes.operators import vertex_normals
+from torchface.landmarks.images.networks.part_finder import PartFinder
+from torchface.rendering.raycast import RayCaster
+from torchface.rig import BlendshapeRig
+
+LEAST_FRAMES = 10
+"""Frames that show the face from which their mean is a reference."""
+
+_ABOVE, _INSIDE = 22.0, 2.0  # millimetres above the brows, and within the jaw's landmarks, that are laid flat
+_FINEST, _COARSEST = 1.0, 1.5  # millimetres a pixel of it
+_OPENINGS = ((slice(36, 42), 3.0), (slice(42, 48), 3.0), (slice(60, 68), 1.0))  # landmarks, and millimetres around them
+_SQUARELY, _FULLY = 0.3, 0.6  # cosines of the view from which skin begins to count, and counts fully
+_EDGE = 2  # pixels beside what is not seen that do not count
+_EVEN, _LOCAL, _DARK, _CONTRAST = 12.0, 20.0, 3.0, 40.0  # millimetres, millimetres, grey levels, grey levels
+_SAMPLES, _ROUNDS = 60, 3  # frames of the reference, and how often they are brought onto it
+_LOOKED_AT, _COVERED = 10, 0.2  # frames in which parts are found, and the share of what covers skin that is too much
+_COVERS = ("glasses", "hand", "cloth", "background")
+_PLAIN = 36.0  # squared grey levels a pixel: skin whose contrast is less can hardly be followed
+_OTHER = 20.0  # grey levels by which skin differs that is something else: a hand, hair, a fold
+_TOGETHER = 16  # pixels within which flows err together
+_THIN = 2  # pixels from one that counts to the next
+_LEAST_ERROR, _PILOT_ERROR = 0.3, 0.5  # millimetres of a flow
+_REWEIGHTINGS = 3
+# What a take's solution varies by about its mean error, 1.5 times that of twelve rendered films; brows of real skin are
+# off by more. Places are off by what the pose is: to the sides and up, millimetres, then by turns, radians.
+_VARIES = {
+    "brow": 0.12, "eyeWide": 0.15, "eyeSquint": 0.12, "cheekSquint": 0.11, "noseSneer": 0.08, "mouthSmile": 0.09,
+    "mouthFrown": 0.08, "mouthDimple": 0.045, "mouthStretch": 0.07, "mouthRoll": 0.045, "mouthPress": 0.04,
+    "jawOpen": 0.05, "mouthClose": 0.024, "mouthLeft": 0.045, "mouthRight": 0.045, "jaw": 0.03, "cheekPuff": 0.023,
+}  # fmt: skip
+_USUALLY = 0.075
+_POSE = (2.0, 2.0, 0.03, 0.03, 0.06, 0.06)
+_UNSEEN = ("eyeBlink", "eyeLook", "tongue")
+_LIFT, _LASTS, _NOISE = 0.1, 10.0, 0.03  # deviation of a mean error; frames that err together; deviation of a weight
+
+
+@dataclass(frozen=True, eq=False)
+class FlatFace:
+    """The face of a rig as somebody before it sees it: H rows of W places on it, and what N shapes move them by."""
+
+    rest: Tensor  # (H,W,3), millimetres
+    basis: Tensor  # (N,H,W,3), millimetres
+    normals: Tensor  # unit, (H,W,3)
+    counts: Tensor  # where there is skin: no eye, no inside of the mouth, (H,W) bool
+    landmarks: Tensor  # their nearest places, row and column, (68,2) int64
+    step: float  # millimetres a pixel
+
+    @staticmethod
+    def of(rig: BlendshapeRig, step: float) -> "FlatFace":
+        """Of an upright rig in millimetres with iBUG's 68 landmarks."""
+        vertices, faces = rig.vertices.detach().double(), rig.neutral.faces
+        marks = vertices[rig.neutral.landmarks]
+        jaw, brows = marks[:17], marks[17:27]
+        x = torch.arange(float(jaw[:, 0].min()) + _INSIDE, float(jaw[:, 0].max()) - _INSIDE, step).double()
+        y = torch.arange(float(brows[:, 1].max()) + _ABOVE, float(jaw[:, 1].min()) + _INSIDE, -step).double()
+        ahead = torch.stack([*torch.meshgrid(x, y, indexing="xy"), vertices[:, 2].max().expand(len(y), len(x))], dim=-1)
+        way = torch.tensor([0.0, 0.0, -1.0]).double().expand(ahead.numel() // 3, 3)
+        hits = RayCaster(vertices, faces).cast(ahead.flatten(0, 1) - way, way)
+        corners, shares = faces[hits.triangle.clamp(min=0)], hits.barycentric.double()[..., None]
+
+        def there(values: Tensor) -> Tensor:
+            return (values.detach().double()[corners] * shares).sum(1).float().unflatten(0, ahead.shape[:2])
+
+        skin = (hits.triangle >= 0).unflatten(0, ahead.shape[:2]).numpy().astype(np.uint8)
+        for rows, around in _OPENINGS:
+            cv2.fillConvexPoly(skin, _grown(marks[rows, :2], around, x, y), 0)
+        normals = torch.nn.functional.normalize(there(vertex_normals(vertices, faces)), dim=-1)
+        skin = cv2.erode(skin, np.ones((3, 3), np.uint8))
+        basis = torch.stack([there(delta) for delta in rig.deltas])
+        nearest = torch.stack([(marks[:, 1] - y[0]) / -step, (marks[:, 0] - x[0]) / step], dim=-1).round().long()
+        nearest = nearest.clamp(min=0).minimum(torch.tensor(skin.shape) - 1)
+        return FlatFace(there(vertices), basis, normals, torch.from_numpy(skin) > 0, nearest, step)
+
+    def seen_in(
+        self, frame: np.ndarray, weights: Tensor, pose: tuple[Tensor, Tensor], calibration: CameraCalibration
+    ) -> tuple[np.ndarray, np.ndarray, Tensor]:
+        """What a frame, grey (h,w), shows at the places, uint8 (H,W), with weights (N,) and a pose (3,3), (3,); how
+        squarely, (H,W) in [0,1]; and where, (H,W,2) pixels."""
+        rotation, translation = pose
+        places = (self.rest + torch.tensordot(weights, self.basis, 1)) @ rotation.T + translation
+        image = places @ calibration.intrinsics.to(places).T
+        at = distort(image[..., :2] / image[..., 2:], calibration)
+        towards = torch.nn.functional.normalize(-places, dim=-1)
+        cosine = ((self.normals @ rotation.T) * towards).sum(-1)
+        seen = ((cosine - _SQUARELY) / (_FULLY - _SQUARELY)).clamp(0, 1).where(places[..., 2] > 0, 0.0)
+        return cv2.remap(frame, at[..., 0].numpy(), at[..., 1].numpy(), cv2.INTER_LINEAR), seen.numpy(), at
+
+    def landmarks_in(self, at: Tensor) -> Tensor:
+        """Landmarks (68,2) where places are at (H,W,2)."""
+        return at[self.landmarks[:, 0], self.landmarks[:, 1]]
+
+    def even(self, picture: np.ndarray) -> np.ndarray:
+        """A picture (H,W) of it without light that is alike all around, and of one contrast, uint8."""
+        grey = picture.astype(np.float32)
+        detail = grey - _soft(grey, _EVEN / self.step)
+        contrast = _soft(np.abs(detail), _LOCAL / self.step) + _DARK
+        return np.clip(128 + _CONTRAST * detail / contrast, 0, 255).astype(np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class SkinMotion:
+    """What the skin says of T frames' weights beside those that were given."""
+
+    change: Tensor  # to be added, in the mean of the frames 0, (T,N)
+    deviation: Tensor  # of it, (N,); infinite for shapes that skin does not show
+
+    def applied(self, weights: Tensor) -> Tensor:
+        r"""Weights (T,N) changed by it, in [0,1].
+
+        The skin does not say how far weights are off in all frames. That they are not below 0 does:
+
+        .. math:: \min_c \; \frac{c^2}{2 \tau^2} + \sum_t \frac{\min(w_t + x_t + c, 0)^2}{2 \cdot 10 \, s^2}
+        """
+        changed = weights + self.change.to(weights)
+        moves = self.change.std(0, correction=0) > self.deviation
+        precision = (_LASTS * (_NOISE**2 + self.deviation.square())).reciprocal().to(weights)
+        lift = torch.zeros_like(weights[0])
+        for _ in range(20):  # Newton's steps of a piecewise quadratic function
+            below = (changed + lift).clamp(max=0)
+            slope = lift / _LIFT**2 + precision * below.sum(0)
+            lift = lift - slope / (1 / _LIFT**2 + precision * (below < 0).sum(0))
+        return (changed + torch.where(moves.to(weights.device), lift, 0.0)).clamp(0, 1)
+
+
+def skin_motion(
+    rig: BlendshapeRig,
+    frames: Iterable[Tensor],
+    weights: Tensor,
+    poses: tuple[Tensor, Tensor],
+    shown: Tensor,
+    calibration: CameraCalibration,
+    parts: PartFinder,
+    done: Callable[[int], None] = lambda frame: None,
+) -> SkinMotion | None:
+    r"""How skin moves beside a take's solution.
+
+    The places of a rig's face show some skin in each frame. Its mean over the frames, brought onto each other by
+    optical flow, is the reference; from it to a frame leads a flow f, millimetres on the face from the front, that
+    small changes of N weights and of the pose explain,
+
+    .. math:: \min_{x, p} \; \sum_g \frac{\rho(f_g - B_g x - P_g p)}{s^2} + \sum_i \frac{x_i^2}{2 \sigma_i^2} + \dots
+
+    with :math:`\sigma_i` what solutions are usually off by and s what the flows of this take are.
+
+    Args:
+        rig: of N shapes, upright, in millimetres, with iBUG's 68 landmarks.
+        frames: pictures, uint8 (3,h,w), of the camera as it is.
+        weights: as solved, (T,N).
+        poses: rig to camera, (T,3,3) and (T,3).
+        shown: frames that show the face, (T,) bool.
+        calibration: of the camera, at the frames' size.
+        parts: finds what is no skin.
+        done: called with each frame's number.
+
+    Returns:
+        What the weights are to be changed by; None where fewer than ten frames show a face.
+
+    Source: Kroeger et al. 2016 for the flow.
+    """
+    if int(shown.sum()) < LEAST_FRAMES:
+        return None
+    weights, rotation, translation = weights.float(), poses[0].float(), poses[1].float()
+    step = float((translation[shown, 2] / calibration.intrinsics[0, 0]).median().clamp(_FINEST, _COARSEST))
+    face = FlatFace.of(rig, step)
+    with TemporaryFile() as file:
+        size = len(weights), *face.counts.shape
+        pictures = np.memmap(file, np.uint8, "w+", shape=size)
+        squarely = np.memmap(file, np.uint8, "w+", offset=pictures.size, shape=size)
+        rows = shown.nonzero()[:, 0]
+        some = rows[torch.linspace(0, len(rows) - 1, min(_SAMPLES, len(rows))).round().long()].tolist()
+        few, covered = some[:: max(1, len(some) // _LOOKED_AT)], torch.zeros(size[1:])
+        for t, frame in zip(range(len(weights)), frames, strict=False):
+            if bool(shown[t]):
+                grey = cv2.cvtColor(np.ascontiguousarray(frame.permute(1, 2, 0).numpy()), cv2.COLOR_RGB2GRAY)
+                picture, seen, at = face.seen_in(grey, weights[t], (rotation[t], translation[t]), calibration)
+                pictures[t], squarely[t] = face.even(picture), np.round(255 * seen)
+            if t in few:
+                covered += parts(frame, face.landmarks_in(at)).around(at, *_COVERS).nan_to_num(1.0) / len(few)
+        face = replace(face, counts=face.counts & (covered < _COVERED))
+        reference = _reference(pictures[some], squarely[some])
+        fit = _Fit.of(face, rig.names, reference)
+        samples = [fit.flow(pictures[t], squarely[t]) for t in few]
+        error = float(np.mean([fit.solved(*sample, _PILOT_ERROR)[2] for sample in samples]))
+        change, deviation = torch.zeros(weights.shape), torch.full((len(rig.names),), torch.inf)
+        spread = []
+        for t in rows.tolist():
+            solved = fit.solved(*fit.flow(pictures[t], squarely[t]), max(error, _LEAST_ERROR))
+            change[t, fit.shapes] = torch.from_numpy(solved[0]).float()
+            spread.append(solved[1])
+            done(t)
+    change[rows] -= change[rows].mean(0)
+    deviation[fit.shapes] = torch.from_numpy(np.mean(spread, axis=0)).float()
+    return SkinMotion(change, deviation)
+
+
+@dataclass(frozen=True, eq=False)
+class _Fit:
+    """The least squares of a flow: M shapes and six movements of the pose, at 2G values of G places."""
+
+    reference: np.ndarray  # (H,W) uint8
+    step: float
+    shapes: list[int]  # of the rig's
+    places: np.ndarray  # those that count, (H,W) bool
+    skin: np.ndarray  # (H,W) float32
+    contrast: tuple[np.ndarray, np.ndarray]  # how far a place can be followed to the side and up, (G,) in [0,1]
+    moves: np.ndarray  # (M+6,2G) float32
+    prior: np.ndarray  # precisions, (M+6,)
+
+    @staticmethod
+    def of(face: FlatFace, names: Sequence[str], reference: np.ndarray) -> "_Fit":
+        called = arkit_names(names)
+        shapes = [row for row, name in enumerate(called) if not name.startswith(_UNSEEN)]
+        places = np.zeros_like(reference, dtype=bool)
+        places[::_THIN, ::_THIN] = face.counts.numpy()[::_THIN, ::_THIN]
+        at = face.rest.numpy()[places]
+        x, y, z = (at - [*np.median(at[:, :2], axis=0), at[:, 2].max()]).T
+        one, none = np.ones_like(x), np.zeros_like(x)
+        pose = np.stack([[one, none, y, x, none, z], [none, one, x, -y, z, none]])
+        basis = face.basis[shapes].numpy()[:, places]
+        moves = np.concatenate([np.stack([basis[..., 0], -basis[..., 1]]), pose], axis=1)
+        slopes = (cv2.Sobel(reference, cv2.CV_32F, *way, scale=1 / 8) for way in ((1, 0), (0, 1)))
+        strong = [_soft(slope**2, 2.0) for slope in slopes]
+        across, up = ((one / (one + _PLAIN))[places] for one in strong)
+        varies = [
+            next((off for start, off in _VARIES.items() if called[row].startswith(start)), _USUALLY) for row in shapes
+        ]
+        prior = np.array([*varies, *_POSE]) ** -2.0
+        skin = face.counts.numpy().astype(np.float32)
+        moves = moves.swapaxes(0, 1).reshape(len(prior), -1).astype(np.float32)
+        return _Fit(reference, face.step, shapes, places, skin, (across, up), moves, prior)
+
+    def flow(self, picture: np.ndarray, squarely: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """How far from the reference's places a frame shows them, (2G,) millimetres; and how far that counts, (2G,) in
+        [0,1]."""
+        flow = _flow(self.reference, picture)
+        other = np.abs(_moved(picture, flow).astype(np.float32) - self.reference)
+        counts = cv2.erode(squarely * (self.skin / 255), np.ones((2 * _EDGE + 1,) * 2, np.uint8))
+        counts = (counts / (1 + (_soft(other, 2.0) / _OTHER) ** 4))[self.places]
+        across, up = self.contrast
+        return self.step * flow[self.places].T.ravel(), np.concatenate([counts * across, counts * up])
+
+    def solved(self, flow: np.ndarray, counts: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray, float]:
+        """The shapes' change (M,) and its deviation (M,), of flows (2G,) with an error, and what is left of the flows;
+        millimetres both."""
+        robust, count = np.ones_like(flow), len(self.shapes)
+        for _ in range(_REWEIGHTINGS):
+            weighted = self.moves * (counts * robust * (_THIN / _TOGETHER / error) ** 2).astype(np.float32)
+            H = (weighted @ self.moves.T).astype(np.float64) + np.diag(self.prior)
+            solution = np.linalg.solve(H, weighted @ flow)
+            left = flow - solution.astype(np.float32) @ self.moves
+            robust = 1 / (1 + (left / (2 * error)) ** 2)
+        share = counts * robust
+        remains = float(np.sqrt((share * left**2).sum() / max(float(share.sum()), 1e-9)))
+        return solution[:count], np.sqrt(np.diag(np.linalg.inv(H)))[:count], remains
+
+
+def _reference(pictures: np.ndarray, squarely: np.ndarray) -> np.ndarray:
+    """The mean of pictures (S,H,W) that are brought onto it, uint8 (H,W), each as far as it sees a place squarely."""
+    share = squarely.astype(np.float32) + 0.25
+    mean = np.average(pictures, 0, share).astype(np.uint8)
+    for _ in range(_ROUNDS):
+        flows = np.stack([_flow(mean, picture) for picture in pictures])
+        flows -= np.average(flows, 0, np.broadcast_to(share[..., None], flows.shape))
+        brought = [_moved(picture, flow) for picture, flow in zip(pictures, flows, strict=True)]
+        mean = np.average(np.stack(brought), 0, share).astype(np.uint8)
+    return mean
+
+
+def _flow(reference: np.ndarray, picture: np.ndarray) -> np.ndarray:
+    """Where a picture shows each place of the reference, beside that, (H,W,2) pixels."""
+    solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
+    solver.setFinestScale(0)
+    return solver.calc(reference, picture, np.zeros((*reference.shape, 2), np.float32))
+
+
+def _moved(picture: np.ndarray, flow: np.ndarray) -> np.ndarray:
+    """A picture (H,W) brought back along a flow from the reference."""
+    y, x = np.indices(picture.shape, dtype=np.float32)
+    return cv2.remap(picture, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+
+
+def _soft(picture: np.ndarray, deviation: float) -> np.ndarray:
+    return cv2.GaussianBlur(picture, (0, 0), deviation)
+
+
+def _grown(outline: Tensor, by: float, x: Tensor, y: Tensor) -> np.ndarray:
+    """The hull of landmarks (M,2), grown by some millimetres, in pixels of places x (W,) and y (H,) falling, int32."""
+    hull = cv2.convexHull(outline.numpy().astype(np.float32))[:, 0]
+    out = hull - hull.mean(0)
+    hull = hull + by * out / np.linalg.norm(out, axis=1, keepdims=True)
+    step = float(x[1] - x[0])
+    return np.round(np.stack([hull[:, 0] - float(x[0]), float(y[0]) - hull[:, 1]], axis=1) / step).astype(np.int32)
