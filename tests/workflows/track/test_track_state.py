@@ -52,7 +52,7 @@ def test_what_is_up_to_date_is_kept(
     smooth = track_video(
         filmed.video, filmed.rig, out, TrackSettings(camera=filmed.camera, overlay="none", whole_take=True)
     )
-    assert set(smooth.seconds) == {"smoothing", "weights"}  # landmarks stay
+    assert set(smooth.seconds) == {"smoothing", "weights", "skin's motion"}  # landmarks stay
     assert not torch.equal(smooth.solution.weights, again.solution.weights)
 
 
