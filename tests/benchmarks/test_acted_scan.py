@@ -1,7 +1,7 @@
-"""Claim: where real skin acts a real take, `track` is nearer to the truth than MediaPipe, and the skin helps.
+"""Claim: where real skin acts a real take, `track` is nearer to the truth than MediaPipe, and the skin helps its brows.
 
-The real scan as a rig of ICT-FaceKit's topology, 75 frames of a take in 640 x 480 pixels, the head turning by 25
-degrees, noise and H.264; eyes look ahead, so gaze is not counted. Heads are measured as in `test_photographed_scan`.
+The real scan as a rig of ICT-FaceKit's topology, 75 frames each of three takes in 640 x 480 pixels, the head turning by
+25 degrees, noise and H.264; eyes look ahead, so gaze is not counted. Heads are measured as in `test_photographed_scan`.
 """
 
 import math
@@ -23,24 +23,26 @@ from torchface.rendering.clay_shading import render
 from torchface.shape_names import ARKIT, mapping
 from torchface.viz.figures.region_colors import as_seen
 from torchface.workflows.rig.actor_rig import rig_actor
+from torchface.workflows.track import track_video
 from torchface.workflows.track.track_inputs import TrackSettings
-from torchface.workflows.track.track_video import track_video
 from train.morphable import ict_head_model
 
 pytestmark = pytest.mark.real
 
-WIDTH, HEIGHT, FOCAL, FACE, FRAMES, FPS, TURN, FIRST = 640, 480, 576.0, 165.0, 75, 30, 25.0, 21.6
+WIDTH, HEIGHT, FOCAL, FACE, FRAMES, FPS, TURN = 640, 480, 576.0, 165.0, 75, 30, 25.0
+TAKES = ((2, 21.6), (0, 23.0), (1, 7.76))  # numbers of takes, and the seconds from which they are acted
 SHOWN = [number for number, name in enumerate(ARKIT) if "Look" not in name]
 BROWS = [number for number, name in enumerate(ARKIT) if name.startswith("brow")]
+FOLLOWED = track_video.followed_weights
 _MOVES = 0.03  # deviation of a weight from which its correlation counts
 
 
-def acted(data: Path, ict: Path, out: Path) -> Tensor:
-    """Writes the film; gives its true weights (T,52)."""
+def acted(data: Path, ict: Path, out: Path, number: int, first: float) -> Tensor:
+    """Writes the film of a take from some second on; gives its true weights (T,52)."""
     james = data / "scans" / "james"
     rig_actor(james / "james.obj", ict, out / "james.glb", james / "james.ljson")
-    rig, take = load_rig(out / "james.glb"), load_take(sorted((data / "performances").glob("*.csv"))[2])
-    rows = [round((FIRST + frame / FPS) * take.fps) for frame in range(FRAMES)]
+    rig, take = load_rig(out / "james.glb"), load_take(sorted((data / "performances").glob("*.csv"))[number])
+    rows = [round((first + frame / FPS) * take.fps) for frame in range(FRAMES)]
     given = take.weights.values[rows, :, 0].float()
     weights = given @ mapping(take.weights.names, rig.names).T
     middle = rig.vertices[rig.neutral.landmarks[17:]].double().mean(0)
@@ -73,9 +75,12 @@ def figures(weights: Tensor, truth: Tensor) -> list[float]:
     return [float((weights - truth)[:, SHOWN].square().mean().sqrt()), typical(SHOWN), typical(BROWS)]
 
 
-def test_a_scan_that_acts(data: Path, ict_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("number", "first"), TAKES)
+def test_a_scan_that_acts(
+    data: Path, ict_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, first: float
+) -> None:
     torch.set_num_threads(1)
-    truth = acted(data, ict_folder, tmp_path)
+    truth = acted(data, ict_folder, tmp_path, number, first)
     film, rows = tmp_path / "film.mp4", {}
     for name, method in {"MediaPipe": mediapipe(data / "peers" / "face_landmarker.task"), "live": live}.items():
         rows[name] = figures(method(Clip(film))[0].nan_to_num(0.0).float(), truth)
@@ -85,7 +90,10 @@ def test_a_scan_that_acts(data: Path, ict_folder: Path, tmp_path: Path, monkeypa
     zoo.save_model(ict_head_model(ict_folder), tmp_path / "people", card)
     for name, most in {"track, landmarks alone": 0.0, "track": multiple_views._MOST_OFF}.items():
         monkeypatch.setattr(multiple_views, "_MOST_OFF", most)
-        tracked = track_video(film, None, tmp_path / name, TrackSettings(overlay="none", heads=tmp_path / "people"))
+        monkeypatch.setattr(track_video, "followed_weights", FOLLOWED if most else lambda _, solved, __: solved.weights)
+        tracked = track_video.track_video(
+            film, None, tmp_path / name, TrackSettings(overlay="none", heads=tmp_path / "people")
+        )
         solved = load_take(tmp_path / name / "live_link.csv").weights
         rows[name] = figures(solved.values[..., 0].float() @ mapping(solved.names, ARKIT).T, truth)
         assert tracked.head is not None
@@ -94,5 +102,6 @@ def test_a_scan_that_acts(data: Path, ict_folder: Path, tmp_path: Path, monkeypa
     print(f"\n{'':26s}{'error':>8s}{'r':>8s}{'brows':>8s}{'head: mean, median, mm':>26s}")
     for name, row in rows.items():
         print(f"{name:26s}" + "".join(f"{value:8.3f}" for value in row + heads.get(name, [])))
-    assert rows["track"][0] < rows["MediaPipe"][0]
-    assert heads["track"][0] < heads["track, landmarks alone"][0]
+    assert rows["track"][0] < 0.97 * rows["track, landmarks alone"][0]
+    assert rows["track"][0] < 0.9 * rows["MediaPipe"][0]
+    assert rows["track"][2] > 0.8  # brows

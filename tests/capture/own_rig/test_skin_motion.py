@@ -1,0 +1,148 @@
+"""Skin that moves: weights by how the face, laid flat, differs from frame to frame."""
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from torchface.capture.own_rig.head_pose import measure_poses
+from torchface.capture.own_rig.skin_motion import SkinMotion, skin_motion
+from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
+from torchface.geometry.cameras.pinhole import look_at
+from torchface.io.video import open_video
+from torchface.landmarks.images.networks.part_finder import FaceParts
+from torchface.landmarks.images.networks.part_network import PARTS
+from torchface.rendering.clay_shading import render
+from torchface.rig import BlendshapeRig
+from torchface.synthetic import performer
+
+FRAMES, WIDTH, HEIGHT = 12, 220, 260
+MOVED = ("browInnerUp", "browOuterUpLeft", "mouthSmileRight", "noseSneerLeft")
+
+
+@dataclass(frozen=True, eq=False)
+class Film:
+    """Pictures of the performer, who turns."""
+
+    pictures: list[Tensor]
+    poses: tuple[Tensor, Tensor]
+    camera: CameraCalibration
+
+
+def part_of(part: str) -> Callable[[Tensor, Tensor], FaceParts]:
+    """What takes whole pictures for one part."""
+
+    def find(image: Tensor, landmarks: Tensor) -> FaceParts:
+        shares = torch.zeros(len(PARTS), 8, 8)
+        shares[PARTS.index(part)] = 1
+        return FaceParts(shares, torch.tensor([[8 / image.shape[-1], 0, 0], [0, 8 / image.shape[-2], 0]]).double())
+
+    return find
+
+
+@pytest.fixture(scope="module")
+def rig() -> BlendshapeRig:
+    return performer()
+
+
+def planted(names: Sequence[str]) -> Tensor:
+    """Weights (T,N) of which each of ``MOVED`` rises and falls in its own time."""
+    phase = torch.linspace(0, 2 * torch.pi, FRAMES + 1)[:-1]
+    weights = torch.zeros(FRAMES, len(names))
+    for number, name in enumerate(MOVED):
+        weights[:, names.index(name)] = 0.25 + 0.25 * (phase * (1 + number // 2) + number).sin()
+    return weights
+
+
+@pytest.fixture(scope="module")
+def filmed(rig: BlendshapeRig) -> Film:
+    middle = rig.vertices[rig.neutral.landmarks[17:]].detach().double().mean(0)
+    cameras = [look_at(middle, 12.0 * math.sin(0.5 * frame), 4.0, 260.0, WIDTH, HEIGHT) for frame in range(FRAMES)]
+    pictures = [
+        (255 * render(rig.neutral.with_vertices(vertices), camera)[:3]).byte()
+        for vertices, camera in zip(rig(planted(rig.names)).detach(), cameras, strict=True)
+    ]
+    poses = (
+        torch.stack([camera.rotation for camera in cameras]),
+        torch.stack([camera.translation for camera in cameras]),
+    )
+    return Film(pictures, poses, CameraCalibration(cameras[0].intrinsics, torch.zeros(5).double(), WIDTH, HEIGHT))
+
+
+def test_skin_says_what_weights_lack(rig: BlendshapeRig, filmed: Film) -> None:
+    truth, shown = planted(rig.names), torch.ones(FRAMES, dtype=torch.bool)
+    given = 0.3 * truth
+    found = skin_motion(rig, filmed.pictures, given, filmed.poses, shown, filmed.camera, part_of("skin"))
+    assert found is not None
+    for name in MOVED:
+        row = rig.names.index(name)
+        lacks = (truth - given)[:, row] - (truth - given)[:, row].mean()
+        found_of = found.change[:, row]
+        assert torch.corrcoef(torch.stack([lacks, found_of]))[0, 1] > 0.93
+        assert 0.15 < found_of @ lacks / lacks.square().sum() < 1.1  # less than all: solutions are seldom so far off
+    off, left = ((weights - truth).square().mean().sqrt() for weights in (given, found.applied(given)))
+    assert left < 0.8 * off
+    blinks = [number for number, name in enumerate(rig.names) if name.startswith("eyeBlink")]
+    assert not found.change[:, blinks].any()
+    assert not torch.isfinite(found.deviation[blinks]).any()
+
+
+def test_what_covers_skin_says_nothing(rig: BlendshapeRig, filmed: Film) -> None:
+    shown = torch.ones(FRAMES, dtype=torch.bool)
+    for part in ("glasses", "hand"):
+        assert (
+            skin_motion(rig, filmed.pictures, planted(rig.names), filmed.poses, shown, filmed.camera, part_of(part))
+            is None
+        )
+
+
+def test_frames_without_a_face_change_nothing(rig: BlendshapeRig, filmed: Film) -> None:
+    truth, shown = planted(rig.names), torch.arange(FRAMES) != 4
+    pictures = [255 - picture if frame == 4 else picture for frame, picture in enumerate(filmed.pictures)]
+    found = skin_motion(rig, pictures, truth, filmed.poses, shown, filmed.camera, part_of("skin"))
+    assert found is not None
+    assert not found.change[4].any()
+    assert float(found.change.abs().max()) < 0.06  # weights that are right stay
+    shown[:3] = False
+    assert skin_motion(rig, pictures, truth, filmed.poses, shown, filmed.camera, part_of("skin")) is None
+
+
+def test_weights_rise_where_they_would_be_below_nothing() -> None:
+    curve = 0.2 * torch.linspace(0, 12.6, 200).sin()
+    change = torch.stack([curve, curve], 1)
+    lifted = SkinMotion(change, torch.tensor([0.02, 0.5])).applied(torch.full((200, 2), 0.1))
+    assert lifted.min() >= 0
+    assert lifted.max() <= 1
+    assert 0.15 < lifted[:, 0].mean() < 0.22  # 0.2 is the least that leaves the curve whole
+    torch.testing.assert_close(lifted[:, 1], (0.1 + curve).clamp(min=0))  # noise, for all that is known
+
+
+@pytest.mark.real
+def test_real_skin_takes_back_weights_that_are_made_up(rig: BlendshapeRig, data: Path) -> None:
+    clip = open_video(data / "video" / "single_face.mp4")
+    count = 24
+    marks = torch.from_numpy(np.load(data / "landmarks" / "mediapipe_68.npz")["single_face"])[:count].double()
+    calibration = assumed_calibration(clip.width, clip.height)
+    rest = rig.vertices[rig.neutral.landmarks].detach().double()
+    poses = measure_poses(rest, marks, calibration.intrinsics.double())
+    pictures = [frame for _, frame in zip(range(count), clip.color_frames(), strict=False)]
+    row = [rig.names.index(name) for name in ("browOuterUpLeft", "browOuterUpRight")]
+    given = torch.full((2, count, len(rig.names)), 0.0)
+    given[:, :, row] = 0.4
+    wave = 0.3 * torch.linspace(0, 9.4, count).sin()
+    given[1, :, row] += wave[:, None]
+    changes = [
+        skin_motion(
+            rig, pictures, weights, (poses.rotation, poses.translation), poses.found, calibration, part_of("skin")
+        )
+        for weights in given
+    ]
+    taken_back = (changes[0].change - changes[1].change)[:, row].mean(1)
+    wave = wave - wave.mean()
+    assert torch.corrcoef(torch.stack([taken_back, wave]))[0, 1] > 0.9
+    assert 0.3 < taken_back @ wave / wave.square().sum() < 1.2
