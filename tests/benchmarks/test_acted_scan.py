@@ -90,7 +90,9 @@ def test_a_scan_that_acts(
     zoo.save_model(ict_head_model(ict_folder), tmp_path / "people", card)
     for name, most in {"track, landmarks alone": 0.0, "track": multiple_views._MOST_OFF}.items():
         monkeypatch.setattr(multiple_views, "_MOST_OFF", most)
-        monkeypatch.setattr(track_video, "followed_weights", FOLLOWED if most else lambda _, solved, __: solved.weights)
+        monkeypatch.setattr(
+            track_video, "followed_weights", FOLLOWED if most else lambda _, solved, *__: solved.weights
+        )
         tracked = track_video.track_video(
             film, None, tmp_path / name, TrackSettings(overlay="none", heads=tmp_path / "people")
         )

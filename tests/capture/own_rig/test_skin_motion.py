@@ -122,6 +122,15 @@ def test_weights_rise_where_they_would_be_below_nothing() -> None:
     torch.testing.assert_close(lifted[:, 1], (0.1 + curve).clamp(min=0))  # noise, for all that is known
 
 
+def test_a_face_at_rest_draws_weights_to_nothing() -> None:
+    """A curve that dips in few frames leaves the others, at rest, nearer to 0 than they would be without."""
+    curve = torch.where(torch.arange(200) % 50 < 5, -0.27, 0.03)[:, None]
+    motion, weights = SkinMotion(curve, torch.tensor([0.02])), torch.full((200, 1), 0.1)
+    free, rested = motion.applied(weights), motion.applied(weights, (curve[:, 0] > 0).float())
+    assert rested[10, 0] < free[10, 0] - 0.02
+    assert rested[10, 0] > 0.13  # where the dips, too, count
+
+
 @pytest.mark.real
 def test_real_skin_takes_back_weights_that_are_made_up(rig: BlendshapeRig, data: Path) -> None:
     clip = open_video(data / "video" / "single_face.mp4")

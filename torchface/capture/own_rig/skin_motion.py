@@ -51,7 +51,11 @@ _VARIES = {
 _USUALLY = 0.075
 _POSE = (2.0, 2.0, 0.03, 0.03, 0.06, 0.06)
 _UNSEEN = ("eyeBlink", "eyeLook", "tongue")
-_LIFT, _LASTS, _NOISE = 0.1, 10.0, 0.03  # deviation of a mean error; frames that err together; deviation of a weight
+_LIFT, _LASTS, _BEYOND = (
+    0.2,
+    10.0,
+    0.1,
+)  # deviation of a mean error; frames that err together; below 0, for skin goes beyond a rig's shapes
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,22 +128,26 @@ class SkinMotion:
     change: Tensor  # to be added, in the mean of the frames 0, (T,N)
     deviation: Tensor  # of it, (N,); infinite for shapes that skin does not show
 
-    def applied(self, weights: Tensor) -> Tensor:
-        r"""Weights (T,N) changed by it, in [0,1].
+    def applied(self, weights: Tensor, resting: Tensor | None = None) -> Tensor:
+        r"""Weights (T,N) changed by it, in [0,1]; ``resting`` says how far the face rests in each frame, (T,) in [0,1].
 
-        The skin does not say how far weights are off in all frames. That they are not below 0 does:
+        The skin does not say how far weights are off in all frames. That they are not below 0, and 0 at rest, does:
 
-        .. math:: \min_c \; \frac{c^2}{2 \tau^2} + \sum_t \frac{\min(w_t + x_t + c, 0)^2}{2 \cdot 10 \, s^2}
+        .. math:: \min_c \; \frac{c^2}{2 \tau^2} + \frac{(\bar w + \bar x + c)^2}{2 \tau^2}
+            + \sum_t \frac{\min(w_t + x_t + c, 0)^2}{2 \cdot 10 \, s^2}
         """
         changed = weights + self.change.to(weights)
-        moves = self.change.std(0, correction=0) > self.deviation
-        precision = (_LASTS * (_NOISE**2 + self.deviation.square())).reciprocal().to(weights)
+        moves = (self.change.std(0, correction=0) > self.deviation).to(weights.device)
+        precision = (_LASTS * (_BEYOND**2 + self.deviation.square())).reciprocal().to(weights)
+        rests = torch.zeros(len(weights)) if resting is None else resting
+        known = float(rests.sum() > 0)
+        at_rest = (rests.to(weights) / rests.sum().clamp(min=1e-9).to(weights)) @ changed
         lift = torch.zeros_like(weights[0])
         for _ in range(20):  # Newton's steps of a piecewise quadratic function
             below = (changed + lift).clamp(max=0)
-            slope = lift / _LIFT**2 + precision * below.sum(0)
-            lift = lift - slope / (1 / _LIFT**2 + precision * (below < 0).sum(0))
-        return (changed + torch.where(moves.to(weights.device), lift, 0.0)).clamp(0, 1)
+            slope = (lift + known * (at_rest + lift)) / _LIFT**2 + precision * below.sum(0)
+            lift = lift - slope / ((1 + known) / _LIFT**2 + precision * (below < 0).sum(0))
+        return (changed + torch.where(moves, lift, 0.0)).clamp(0, 1)
 
 
 def skin_motion(

@@ -15,8 +15,13 @@ from torchface.workflows.track.take_solution import calm_window
 from torchface.workflows.track.track_inputs import TrackInputs
 
 
-def followed_weights(inputs: TrackInputs, solution: VideoSolution, progress: Progress) -> Tensor:
-    """Weights (T,N) by the skin of a take's frames; the solution's where there are no pictures, or too few."""
+def followed_weights(
+    inputs: TrackInputs, solution: VideoSolution, resting: Tensor | None, progress: Progress
+) -> Tensor:
+    """Weights (T,N) by the skin of a take's frames; the solution's where there are no pictures, or too few.
+
+    How far the face rests in each frame, (T,), is known where an expression was read.
+    """
     clip, rig, count = inputs.clip, inputs.actor, len(solution.weights)
     if isinstance(clip, BlankVideo):
         return solution.weights
@@ -34,5 +39,5 @@ def followed_weights(inputs: TrackInputs, solution: VideoSolution, progress: Pro
         return solution.weights
     window = calm_window(clip.fps, count)
     calm = motion if window is None else replace(motion, change=savitzky_golay(motion.change, window))
-    weights = calm.applied(solution.weights)
+    weights = calm.applied(solution.weights, resting)
     return signed_difference(weights, signed_quantities(rig.names).to(weights.device))

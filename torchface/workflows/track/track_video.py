@@ -42,6 +42,7 @@ from torchface.workflows.track.take_solution import (
     keep_solution,
     kept_solution,
     known_offsets,
+    known_rest,
     new_offsets,
     new_solution,
     rig_digest,
@@ -127,8 +128,8 @@ def track_video(
                 measured = replace(measured or FaceMeasurements(), views=views)
             solution = new_solution(inputs, solver, landmarks, sure, times, progress, measured)
         with _timed(seconds, "skin's motion"):
-            weights, pose = followed_weights(inputs, solution, progress), (solution.rotation, solution.translation)
-            solution = solver.solution(landmarks, sure, weights, *pose, measured)
+            weights = followed_weights(inputs, solution, known_rest(reading), progress)
+            solution = solver.solution(landmarks, sure, weights, solution.rotation, solution.translation, measured)
         keep_solution(state, key, solution)
     tracked = Tracked(
         inputs,
