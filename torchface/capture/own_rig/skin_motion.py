@@ -38,9 +38,9 @@ _COVERS = ("glasses", "hand", "cloth", "background")
 _PLAIN = 36.0  # squared grey levels a pixel: skin whose contrast is less can hardly be followed
 _OTHER = 20.0  # grey levels by which skin differs that is something else: a hand, hair, a fold
 _TOGETHER = 16  # pixels within which flows err together
-_THIN = 2  # pixels from one that counts to the next
+_THIN = 3  # pixels from one that counts to the next
 _LEAST_ERROR, _PILOT_ERROR = 0.3, 0.5  # millimetres of a flow
-_REWEIGHTINGS = 3
+_REWEIGHTINGS = 2
 # What a take's solution varies by about its mean error, 1.5 times that of twelve rendered films; brows of real skin are
 # off by more. Places are off by what the pose is: to the sides and up, millimetres, then by turns, radians.
 _VARIES = {
