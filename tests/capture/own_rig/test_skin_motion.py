@@ -1,17 +1,23 @@
 """Skin that moves: weights by how the face, laid flat, differs from frame to frame."""
 
+import errno
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 from torch import Tensor
 
+from torchface.capture.own_rig import skin_motion as module
 from torchface.capture.own_rig.head_pose import measure_poses
 from torchface.capture.own_rig.skin_motion import SkinMotion, skin_motion
+from torchface.correctives.corrective_shapes import Corrective, Correctives
+from torchface.errors import FileFormatError
 from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io.video import open_video
@@ -32,6 +38,15 @@ class Film:
     pictures: list[Tensor]
     poses: tuple[Tensor, Tensor]
     camera: CameraCalibration
+
+
+class FullFile(BytesIO):
+    """A file on a disk that has room for 1000 bytes."""
+
+    def write(self, values: Any) -> int:
+        if self.tell() >= 1000:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return super().write(values[:1000])
 
 
 def part_of(part: str) -> Callable[[Tensor, Tensor], FaceParts]:
@@ -61,6 +76,10 @@ def planted(names: Sequence[str]) -> Tensor:
 
 @pytest.fixture(scope="module")
 def filmed(rig: BlendshapeRig) -> Film:
+    return film_of(rig)
+
+
+def film_of(rig: BlendshapeRig) -> Film:
     middle = rig.vertices[rig.neutral.landmarks[17:]].detach().double().mean(0)
     cameras = [look_at(middle, 12.0 * math.sin(0.5 * frame), 4.0, 260.0, WIDTH, HEIGHT) for frame in range(FRAMES)]
     pictures = [
@@ -110,6 +129,37 @@ def test_frames_without_a_face_change_nothing(rig: BlendshapeRig, filmed: Film) 
     assert float(found.change.abs().max()) < 0.06  # weights that are right stay
     shown[:3] = False
     assert skin_motion(rig, pictures, truth, filmed.poses, shown, filmed.camera, part_of("skin")) is None
+
+
+def test_places_beyond_the_picture_say_nothing(rig: BlendshapeRig, filmed: Film) -> None:
+    """The picture's edge lies somewhere else on the face in each frame."""
+    truth, shown = planted(rig.names), torch.ones(FRAMES, dtype=torch.bool)
+    cut = [picture[:, :, :80].contiguous() for picture in filmed.pictures]
+    found = skin_motion(rig, cut, truth, filmed.poses, shown, filmed.camera, part_of("skin"))
+    assert found is not None
+    assert float(found.change.abs().max()) < 0.045
+
+
+def test_a_surface_that_correctives_move_is_the_rigs(rig: BlendshapeRig) -> None:
+    both = torch.stack([rig.deltas[rig.names.index(name)] for name in MOVED[:2]]).sum(0)
+    corrective = Correctives(-0.6 * both[None], (Corrective("brow", MOVED[:2]),))
+    corrected = BlendshapeRig(rig.neutral, rig.deltas, rig.names, corrective)
+    truth, film = planted(rig.names), film_of(corrected)
+    changes = [
+        skin_motion(one, film.pictures, truth, film.poses, torch.ones(FRAMES) > 0, film.camera, part_of("skin"))
+        for one in (rig, corrected)
+    ]
+    without, right = (float(found.change.abs().mean()) for found in changes)
+    assert right < 0.8 * without
+
+
+def test_a_temporary_folder_that_is_full_is_said(
+    rig: BlendshapeRig, filmed: Film, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown = torch.ones(FRAMES, dtype=torch.bool)
+    monkeypatch.setattr(module, "TemporaryFile", lambda **_: FullFile())
+    with pytest.raises(FileFormatError, match=r"no room \(No space left on device\).* 12 frames, expected 0\.\d MB"):
+        skin_motion(rig, filmed.pictures, planted(rig.names), filmed.poses, shown, filmed.camera, part_of("skin"))
 
 
 def test_weights_rise_where_they_would_be_below_nothing() -> None:

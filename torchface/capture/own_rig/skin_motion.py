@@ -7,7 +7,8 @@ by, from frame to frame, is what the weights are.
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
-from tempfile import TemporaryFile
+from tempfile import TemporaryFile, gettempdir
+from typing import BinaryIO
 
 import cv2
 import numpy as np
@@ -15,6 +16,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.own_rig.eye_geometry import arkit_names
+from torchface.errors import FileFormatError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.cameras.distortion import distort
 from torchface.geometry.meshes.operators import vertex_normals
@@ -51,11 +53,8 @@ _VARIES = {
 _USUALLY = 0.075
 _POSE = (2.0, 2.0, 0.03, 0.03, 0.06, 0.06)
 _UNSEEN = ("eyeBlink", "eyeLook", "tongue")
-_LIFT, _LASTS, _BEYOND = (
-    0.2,
-    10.0,
-    0.1,
-)  # deviation of a mean error; frames that err together; below 0, for skin goes beyond a rig's shapes
+# Deviation of a mean error; frames that err together; below 0, for skin goes beyond a rig's shapes.
+_LIFT, _LASTS, _BEYOND = 0.2, 10.0, 0.1
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +63,7 @@ class FlatFace:
 
     rest: Tensor  # (H,W,3), millimetres
     basis: Tensor  # (N,H,W,3), millimetres
+    acting: Callable[[Tensor], Tensor]  # places (H,W,3) at weights (N,), with the rig's correctives
     normals: Tensor  # unit, (H,W,3)
     counts: Tensor  # where there is skin: no eye, no inside of the mouth, (H,W) bool
     landmarks: Tensor  # their nearest places, row and column, (68,2) int64
@@ -93,20 +93,26 @@ class FlatFace:
         basis = torch.stack([there(delta) for delta in rig.deltas])
         nearest = torch.stack([(marks[:, 1] - y[0]) / -step, (marks[:, 0] - x[0]) / step], dim=-1).round().long()
         nearest = nearest.clamp(min=0).minimum(torch.tensor(skin.shape) - 1)
-        return FlatFace(there(vertices), basis, normals, torch.from_numpy(skin) > 0, nearest, step)
+
+        def acting(weights: Tensor) -> Tensor:
+            return there(rig(weights[None])[0])
+
+        return FlatFace(there(vertices), basis, acting, normals, torch.from_numpy(skin) > 0, nearest, step)
 
     def seen_in(
         self, frame: np.ndarray, weights: Tensor, pose: tuple[Tensor, Tensor], calibration: CameraCalibration
     ) -> tuple[np.ndarray, np.ndarray, Tensor]:
         """What a frame, grey (h,w), shows at the places, uint8 (H,W), with weights (N,) and a pose (3,3), (3,); how
-        squarely, (H,W) in [0,1]; and where, (H,W,2) pixels."""
+        squarely, (H,W) in [0,1], 0 beyond the frame; and where, (H,W,2) pixels."""
         rotation, translation = pose
-        places = (self.rest + torch.tensordot(weights, self.basis, 1)) @ rotation.T + translation
+        places = self.acting(weights) @ rotation.T + translation
         image = places @ calibration.intrinsics.to(places).T
         at = distort(image[..., :2] / image[..., 2:], calibration)
         towards = torch.nn.functional.normalize(-places, dim=-1)
         cosine = ((self.normals @ rotation.T) * towards).sum(-1)
-        seen = ((cosine - _SQUARELY) / (_FULLY - _SQUARELY)).clamp(0, 1).where(places[..., 2] > 0, 0.0)
+        last = torch.tensor(frame.shape[::-1]) - 1
+        there = (places[..., 2] > 0) & ((at >= 0) & (at <= last)).all(-1)
+        seen = ((cosine - _SQUARELY) / (_FULLY - _SQUARELY)).clamp(0, 1).where(there, 0.0)
         return cv2.remap(frame, at[..., 0].numpy(), at[..., 1].numpy(), cv2.INTER_LINEAR), seen.numpy(), at
 
     def landmarks_in(self, at: Tensor) -> Tensor:
@@ -135,6 +141,9 @@ class SkinMotion:
 
         .. math:: \min_c \; \frac{c^2}{2 \tau^2} + \frac{(\bar w + \bar x + c)^2}{2 \tau^2}
             + \sum_t \frac{\min(w_t + x_t + c, 0)^2}{2 \cdot 10 \, s^2}
+
+        with :math:`\tau = 0.2`, the means over the frames at rest, and :math:`s^2` the deviation's square and 0.1's. A
+        shape that changes by less than its deviation is not lifted: that is noise.
         """
         changed = weights + self.change.to(weights)
         moves = (self.change.std(0, correction=0) > self.deviation).to(weights.device)
@@ -168,7 +177,8 @@ def skin_motion(
 
     .. math:: \min_{x, p} \; \sum_g \frac{\rho(f_g - B_g x - P_g p)}{s^2} + \sum_i \frac{x_i^2}{2 \sigma_i^2} + \dots
 
-    with :math:`\sigma_i` what solutions are usually off by and s what the flows of this take are.
+    with :math:`\sigma_i` what solutions are usually off by and s what the flows of this take are, of which those within 16
+    pixels err together.
 
     Args:
         rig: of N shapes, upright, in millimetres, with iBUG's 68 landmarks.
@@ -183,6 +193,9 @@ def skin_motion(
     Returns:
         What the weights are to be changed by; None where fewer than ten frames show a face, or next to no skin.
 
+    Raises:
+        FileFormatError: the folder for temporary files cannot hold the pictures, two bytes a place and frame.
+
     Source: Kroeger et al. 2016 for the flow.
     """
     if int(shown.sum()) < LEAST_FRAMES:
@@ -190,20 +203,19 @@ def skin_motion(
     weights, rotation, translation = weights.float(), poses[0].float(), poses[1].float()
     step = float((translation[shown, 2] / calibration.intrinsics[0, 0]).median().clamp(_FINEST, _COARSEST))
     face = FlatFace.of(rig, step)
-    with TemporaryFile() as file:
-        size = len(weights), *face.counts.shape
-        pictures = np.memmap(file, np.uint8, "w+", shape=size)
-        squarely = np.memmap(file, np.uint8, "w+", offset=pictures.size, shape=size)
-        rows = shown.nonzero()[:, 0]
-        some = rows[torch.linspace(0, len(rows) - 1, min(_SAMPLES, len(rows))).round().long()].tolist()
-        few, covered = some[:: max(1, len(some) // _LOOKED_AT)], torch.zeros(size[1:])
+    with TemporaryFile(buffering=0) as file:
+        rows, size = shown.nonzero()[:, 0], face.counts.shape
+        some = torch.linspace(0, len(rows) - 1, min(_SAMPLES, len(rows))).round().long().tolist()
+        few, covered = some[:: max(1, len(some) // _LOOKED_AT)], torch.zeros(size)
+        looked_at = rows[few].tolist()
         for t, frame in zip(range(len(weights)), frames, strict=False):
             if bool(shown[t]):
                 grey = cv2.cvtColor(np.ascontiguousarray(frame.permute(1, 2, 0).numpy()), cv2.COLOR_RGB2GRAY)
                 picture, seen, at = face.seen_in(grey, weights[t], (rotation[t], translation[t]), calibration)
-                pictures[t], squarely[t] = face.even(picture), np.round(255 * seen)
-            if t in few:
+                _append(file, np.stack([face.even(picture), np.round(255 * seen).astype(np.uint8)]), len(rows))
+            if t in looked_at:
                 covered += parts(frame, face.landmarks_in(at)).around(at, *_COVERS).nan_to_num(1.0) / len(few)
+        pictures, squarely = np.memmap(file, np.uint8, "r", shape=(len(rows), 2, *size)).swapaxes(0, 1)
         face = replace(face, counts=face.counts & (covered < _COVERED))
         if int(face.counts.sum()) < _LEAST_PLACES:
             return None
@@ -213,14 +225,27 @@ def skin_motion(
         error = float(np.mean([fit.solved(*sample, _PILOT_ERROR)[2] for sample in samples]))
         change, deviation = torch.zeros(weights.shape), torch.full((len(rig.names),), torch.inf)
         spread = []
-        for t in rows.tolist():
-            solved = fit.solved(*fit.flow(pictures[t], squarely[t]), max(error, _LEAST_ERROR))
+        for t, picture, seen in zip(rows.tolist(), pictures, squarely, strict=True):
+            solved = fit.solved(*fit.flow(picture, seen), max(error, _LEAST_ERROR))
             change[t, fit.shapes] = torch.from_numpy(solved[0]).float()
             spread.append(solved[1])
             done(t)
     change[rows] -= change[rows].mean(0)
     deviation[fit.shapes] = torch.from_numpy(np.mean(spread, axis=0)).float()
     return SkinMotion(change, deviation)
+
+
+def _append(file: BinaryIO, pictures: np.ndarray, frames: int) -> None:
+    """Writes a frame's pictures; a map that is written into ends the process where the disk is full."""
+    left = memoryview(pictures.tobytes())
+    try:
+        while left:
+            left = left[file.write(left) :]
+    except OSError as error:
+        raise FileFormatError(
+            f"{gettempdir()}: found no room ({error.strerror}) for a temporary file of the skin in {frames} frames, "
+            f"expected {frames * pictures.nbytes / 1e6:,.1f} MB; free some, or name a folder on another disk as TMPDIR"
+        ) from error
 
 
 @dataclass(frozen=True, eq=False)
