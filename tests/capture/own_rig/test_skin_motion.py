@@ -15,7 +15,7 @@ from torch import Tensor
 
 from torchface.capture.own_rig import skin_motion as module
 from torchface.capture.own_rig.head_pose import measure_poses
-from torchface.capture.own_rig.skin_motion import SkinMotion, skin_motion
+from torchface.capture.own_rig.skin_motion import FlatFace, SkinMotion, skin_motion
 from torchface.correctives.corrective_shapes import Corrective, Correctives
 from torchface.errors import FileFormatError
 from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
@@ -106,6 +106,7 @@ def test_skin_says_what_weights_lack(rig: BlendshapeRig, filmed: Film) -> None:
         assert 0.15 < found_of @ lacks / lacks.square().sum() < 1.1  # less than all: solutions are seldom so far off
     off, left = ((weights - truth).square().mean().sqrt() for weights in (given, found.applied(given)))
     assert left < 0.8 * off
+    torch.testing.assert_close(found.change.mean(0), torch.zeros(len(rig.names)))
     blinks = [number for number, name in enumerate(rig.names) if name.startswith("eyeBlink")]
     assert not found.change[:, blinks].any()
     assert not torch.isfinite(found.deviation[blinks]).any()
@@ -129,6 +130,23 @@ def test_frames_without_a_face_change_nothing(rig: BlendshapeRig, filmed: Film) 
     assert float(found.change.abs().max()) < 0.06  # weights that are right stay
     shown[:3] = False
     assert skin_motion(rig, pictures, truth, filmed.poses, shown, filmed.camera, part_of("skin")) is None
+
+
+def test_skin_that_faces_the_camera_counts(rig: BlendshapeRig) -> None:
+    face = FlatFace.of(rig, 1.5)
+    there = face.counts[face.landmarks[:, 0], face.landmarks[:, 1]]
+    assert there[27:36].all()  # the nose
+    assert not there[[*range(36, 48), *range(60, 68)]].any()  # eyes and the mouth's inside
+    middle = rig.vertices[rig.neutral.landmarks[17:]].detach().double().mean(0)
+    for turn in (-50.0, 50.0):
+        camera = look_at(middle, turn, 4.0, 260.0, WIDTH, HEIGHT)
+        calibration = CameraCalibration(camera.intrinsics, torch.zeros(5).double(), WIDTH, HEIGHT)
+        picture, pose = np.zeros((HEIGHT, WIDTH), np.uint8), (camera.rotation.float(), camera.translation.float())
+        _, squarely, _ = face.seen_in(picture, torch.zeros(len(rig.names)), pose, calibration)
+        sides = squarely[*face.landmarks[[3, 13]].T.numpy()]
+        far, near = sorted(sides)
+        assert far == 0
+        assert near > 0.5
 
 
 def test_places_beyond_the_picture_say_nothing(rig: BlendshapeRig, filmed: Film) -> None:

@@ -177,8 +177,8 @@ def skin_motion(
 
     .. math:: \min_{x, p} \; \sum_g \frac{\rho(f_g - B_g x - P_g p)}{s^2} + \sum_i \frac{x_i^2}{2 \sigma_i^2} + \dots
 
-    with :math:`\sigma_i` what solutions are usually off by and s what the flows of this take are, of which those within 16
-    pixels err together.
+    with :math:`\sigma_i` what solutions are usually off by and s what the flows of this take are, of which those
+    within 16 pixels err together.
 
     Args:
         rig: of N shapes, upright, in millimetres, with iBUG's 68 landmarks.
