@@ -104,6 +104,7 @@ def test_a_scan_that_acts(
     print(f"\n{'':26s}{'error':>8s}{'r':>8s}{'brows':>8s}{'head: mean, median, mm':>26s}")
     for name, row in rows.items():
         print(f"{name:26s}" + "".join(f"{value:8.3f}" for value in row + heads.get(name, [])))
-    assert rows["track"][0] < 0.97 * rows["track, landmarks alone"][0]
+    assert rows["track"][0] < rows["track, landmarks alone"][0]
+    assert rows["track"][1] > rows["track, landmarks alone"][1] + 0.05
     assert rows["track"][0] < 0.9 * rows["MediaPipe"][0]
     assert rows["track"][2] > 0.8  # brows
