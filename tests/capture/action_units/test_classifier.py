@@ -174,7 +174,6 @@ def test_two_performers_can_be_learned_from(
         assert level_agreement(classify(found, video), planted(truth, found.units))["within_one"] > 0.95
 
 
-@pytest.mark.bench  # tests/modules exports the module to a graph of PyTorch's
 def test_from_disk_and_from_onnx(
     session: RecordedSession, regions: RegionVideo, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

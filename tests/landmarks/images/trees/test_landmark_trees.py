@@ -220,7 +220,6 @@ def test_a_model_of_full_size_stays_below_30_mb(tmp_path: Path) -> None:
     assert record.size < 8e6
 
 
-@pytest.mark.bench  # tests/modules exports the module to a graph of PyTorch's
 def test_the_graph_computes_the_same(tmp_path: Path) -> None:
     path, learned = tmp_path / "trees.onnx", LandmarkTrees.fit(*blobs(60, 0), replace(FEW, cascades=2))
     report = export_landmark_trees(learned, path, {"licence": "MIT"})
