@@ -32,7 +32,7 @@ _FINEST, _COARSEST = 1.0, 1.5  # millimetres a pixel of it
 _OPENINGS = ((slice(36, 42), 3.0), (slice(42, 48), 3.0), (slice(60, 68), 1.0))  # landmarks, and millimetres around them
 _SQUARELY, _FULLY = 0.3, 0.6  # cosines of the view from which skin begins to count, and counts fully
 _EDGE = 2  # pixels beside what is not seen that do not count
-_EVEN, _LOCAL, _DARK, _CONTRAST = 12.0, 20.0, 3.0, 40.0  # millimetres, millimetres, grey levels, grey levels
+_EVEN, _LOCAL, _DARK, _CONTRAST = 20.0, 34.0, 3.0, 40.0  # millimetres to each side, likewise, grey levels, likewise
 _SAMPLES, _ROUNDS = 40, 2  # frames of the reference, and how often they are brought onto it
 _LOOKED_AT, _COVERED = 10, 0.2  # frames in which parts are found, and the share of what covers skin that is too much
 _LEAST_PLACES = 1000  # of skin: a tenth of a face
@@ -100,20 +100,25 @@ class FlatFace:
         return FlatFace(there(vertices), basis, acting, normals, torch.from_numpy(skin) > 0, nearest, step)
 
     def seen_in(
-        self, frame: np.ndarray, weights: Tensor, pose: tuple[Tensor, Tensor], calibration: CameraCalibration
+        self, frame: Tensor, weights: Tensor, pose: tuple[Tensor, Tensor], calibration: CameraCalibration
     ) -> tuple[np.ndarray, np.ndarray, Tensor]:
-        """What a frame, grey (h,w), shows at the places, uint8 (H,W), with weights (N,) and a pose (3,3), (3,); how
+        """What a frame, uint8 (3,h,w), shows at the places, grey (H,W), with weights (N,) and a pose (3,3), (3,); how
         squarely, (H,W) in [0,1], 0 beyond the frame; and where, (H,W,2) pixels."""
         rotation, translation = pose
         places = self.acting(weights) @ rotation.T + translation
         image = places @ calibration.intrinsics.to(places).T
-        at = distort(image[..., :2] / image[..., 2:], calibration)
+        at = image[..., :2] / image[..., 2:]
+        at = distort(at, calibration) if calibration.distortion.any() else at
         towards = torch.nn.functional.normalize(-places, dim=-1)
         cosine = ((self.normals @ rotation.T) * towards).sum(-1)
-        last = torch.tensor(frame.shape[::-1]) - 1
+        last = torch.tensor([frame.shape[2], frame.shape[1]]) - 1
         there = (places[..., 2] > 0) & ((at >= 0) & (at <= last)).all(-1)
         seen = ((cosine - _SQUARELY) / (_FULLY - _SQUARELY)).clamp(0, 1).where(there, 0.0)
-        return cv2.remap(frame, at[..., 0].numpy(), at[..., 1].numpy(), cv2.INTER_LINEAR), seen.numpy(), at
+        first, end = at.flatten(0, 1)[there.flatten()].aminmax(dim=0) if there.any() else (0 * last, last)
+        (left, top), (right, bottom) = first.long().tolist(), (end.long() + 2).tolist()
+        grey = cv2.cvtColor(frame[:, top:bottom, left:right].permute(1, 2, 0).contiguous().numpy(), cv2.COLOR_RGB2GRAY)
+        x, y = at[..., 0].numpy() - left, at[..., 1].numpy() - top
+        return cv2.remap(grey, x, y, cv2.INTER_LINEAR), seen.numpy(), at
 
     def landmarks_in(self, at: Tensor) -> Tensor:
         """Landmarks (68,2) where places are at (H,W,2)."""
@@ -122,8 +127,9 @@ class FlatFace:
     def even(self, picture: np.ndarray) -> np.ndarray:
         """A picture (H,W) of it without light that is alike all around, and of one contrast, uint8."""
         grey = picture.astype(np.float32)
-        detail = grey - _soft(grey, _EVEN / self.step)
-        contrast = _soft(np.abs(detail), _LOCAL / self.step) + _DARK
+        even, local = (2 * round(around / self.step) + 1 for around in (_EVEN, _LOCAL))
+        detail = grey - cv2.blur(grey, (even, even))
+        contrast = cv2.blur(np.abs(detail), (local, local)) + _DARK
         return np.clip(128 + _CONTRAST * detail / contrast, 0, 255).astype(np.uint8)
 
 
@@ -210,8 +216,7 @@ def skin_motion(
         looked_at = rows[few].tolist()
         for t, frame in zip(range(len(weights)), frames, strict=False):
             if bool(shown[t]):
-                grey = cv2.cvtColor(np.ascontiguousarray(frame.permute(1, 2, 0).numpy()), cv2.COLOR_RGB2GRAY)
-                picture, seen, at = face.seen_in(grey, weights[t], (rotation[t], translation[t]), calibration)
+                picture, seen, at = face.seen_in(frame, weights[t], (rotation[t], translation[t]), calibration)
                 _append(file, np.stack([face.even(picture), np.round(255 * seen).astype(np.uint8)]), len(rows))
             if t in looked_at:
                 covered += parts(frame, face.landmarks_in(at)).around(at, *_COVERS).nan_to_num(1.0) / len(few)
