@@ -141,7 +141,10 @@ def test_skin_that_faces_the_camera_counts(rig: BlendshapeRig) -> None:
     for turn in (-50.0, 50.0):
         camera = look_at(middle, turn, 4.0, 260.0, WIDTH, HEIGHT)
         calibration = CameraCalibration(camera.intrinsics, torch.zeros(5).double(), WIDTH, HEIGHT)
-        picture, pose = np.zeros((HEIGHT, WIDTH), np.uint8), (camera.rotation.float(), camera.translation.float())
+        picture, pose = (
+            torch.zeros(3, HEIGHT, WIDTH, dtype=torch.uint8),
+            (camera.rotation.float(), camera.translation.float()),
+        )
         _, squarely, _ = face.seen_in(picture, torch.zeros(len(rig.names)), pose, calibration)
         sides = squarely[*face.landmarks[[3, 13]].T.numpy()]
         far, near = sorted(sides)

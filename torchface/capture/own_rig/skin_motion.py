@@ -32,7 +32,7 @@ _FINEST, _COARSEST = 1.0, 1.5  # millimetres a pixel of it
 _OPENINGS = ((slice(36, 42), 3.0), (slice(42, 48), 3.0), (slice(60, 68), 1.0))  # landmarks, and millimetres around them
 _SQUARELY, _FULLY = 0.3, 0.6  # cosines of the view from which skin begins to count, and counts fully
 _EDGE = 2  # pixels beside what is not seen that do not count
-_EVEN, _LOCAL, _DARK, _CONTRAST = 20.0, 34.0, 3.0, 40.0  # millimetres to each side, likewise, grey levels, likewise
+_EVEN, _LOCAL, _DARK, _CONTRAST = 12.0, 20.0, 3.0, 40.0  # millimetres, millimetres, grey levels, grey levels
 _SAMPLES, _ROUNDS = 40, 2  # frames of the reference, and how often they are brought onto it
 _LOOKED_AT, _COVERED = 10, 0.2  # frames in which parts are found, and the share of what covers skin that is too much
 _LEAST_PLACES = 1000  # of skin: a tenth of a face
@@ -127,9 +127,8 @@ class FlatFace:
     def even(self, picture: np.ndarray) -> np.ndarray:
         """A picture (H,W) of it without light that is alike all around, and of one contrast, uint8."""
         grey = picture.astype(np.float32)
-        even, local = (2 * round(around / self.step) + 1 for around in (_EVEN, _LOCAL))
-        detail = grey - cv2.blur(grey, (even, even))
-        contrast = cv2.blur(np.abs(detail), (local, local)) + _DARK
+        detail = grey - _soft(grey, _EVEN / self.step)
+        contrast = _soft(np.abs(detail), _LOCAL / self.step) + _DARK
         return np.clip(128 + _CONTRAST * detail / contrast, 0, 255).astype(np.uint8)
 
 
