@@ -198,6 +198,18 @@ def test_a_registration_that_bent_eyeballs_gets_round_ones_behind_the_lids() -> 
     assert float((off - own * off.mean() / own.mean()).abs().max()) < 0.1
 
 
+@pytest.mark.parametrize("bared", [{"mouthUpperUpLeft": 0.5, "mouthUpperUpRight": 0.5}, {"mouthFunnel": 0.8}])
+def test_teeth_do_not_rise_with_a_lip_that_bares_them(bared: dict[str, float]) -> None:
+    """They followed it wholly, by 3.8 and 3.9 mm."""
+    template = character(size=64).rig.select(list(bared))
+    parts, rest = inner_parts(template), template.vertices
+    head = template(torch.tensor([[bared[name] for name in template.names]]))[0]
+    head[parts.vertices] = rest[parts.vertices]
+    placed = place_parts(template, template.neutral.with_vertices(head), parts).vertices
+    teeth = template.neutral.regions["teeth_upper"]
+    assert float((placed - rest)[teeth, 1].mean().abs()) < 1.5
+
+
 @pytest.mark.parametrize(("higher", "wider"), [(-4.0, 1.0), (4.0, 1.0), (3.0, 1.15)])
 def test_teeth_show_under_a_longer_or_shorter_upper_lip_as_in_the_template(higher: float, wider: float) -> None:
     """Placed by all the skin before them they hung 5.4 mm under the lip of a real scan."""

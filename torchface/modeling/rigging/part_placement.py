@@ -24,7 +24,11 @@ _MAX_TOTAL_WEIGHT = 20.0  # of a registered skin, whose errors are neighbours' t
 # How far people's eyeballs are from where the skin around carries a template's: across, up and to the front.
 _TRANSLATION_DEVIATION = (0.5, 0.8, 1.0)
 _LIP_DEVIATION = 0.03  # of teeth in height, which an open mouth shows
-_MOUTH, _UPPER_LIP = 48, [62]  # of iBUG's landmarks: the first of the mouth, the middle of the edge over teeth
+_MOUTH, _LIPS = (
+    48,
+    [62, 66],
+)  # of iBUG's landmarks: the first of the mouth, the middles of the upper lip's edge and lower
+_PARTED = 3.5  # millimetres between them from which a mouth is open
 _SCALE_DEVIATION = 0.03
 _FACING = 0.6
 _OUTLIER = 2.0
@@ -85,7 +89,7 @@ def place_parts(template: BlendshapeRig, neutral: Mesh, parts: InnerParts) -> Me
         bones = parts.vertices[own & parts.hard]
         if len(bones) == 0:
             continue
-        fitted = _fitted(aligned, found, bones, parts, _lip_before(template.neutral, aligned, bones))
+        fitted = _fitted(aligned, found, bones, parts, _lips_before(template.neutral, aligned, bones))
         placed[bones] = fitted.apply(aligned[None, bones])[0]
         shells = parts.vertices[own & ~parts.hard]
         middle = placed[bones].mean(0)
@@ -195,17 +199,17 @@ def _following(aligned: Tensor, found: Tensor, parts: InnerParts, body: Tensor) 
     return placed
 
 
-def _lip_before(template: Mesh, aligned: Tensor, bones: Tensor) -> Tensor | None:
-    """The vertex of the upper lip's edge, (1,), if bones lie nearer to the mouth than to other landmarks."""
+def _lips_before(template: Mesh, aligned: Tensor, bones: Tensor) -> Tensor | None:
+    """The vertices of the lips' edges, upper and lower, (2,), if bones lie nearest to the mouth of all landmarks."""
     marks = None if template.annotations is None else template.annotations.landmarks
     if marks is None or len(marks) != 68:
         return None
     marks = marks.cpu()
     beside = cKDTree(aligned[bones].numpy()).query(aligned[marks].numpy())[0].argmin()
-    return marks[_UPPER_LIP] if beside >= _MOUTH else None
+    return marks[_LIPS] if beside >= _MOUTH else None
 
 
-def _fitted(aligned: Tensor, found: Tensor, bones: Tensor, parts: InnerParts, lip: Tensor | None) -> Similarity:
+def _fitted(aligned: Tensor, found: Tensor, bones: Tensor, parts: InnerParts, lips: Tensor | None) -> Similarity:
     """The similarity that takes a group's hard parts from where the template aligned with the head has them."""
     middle = aligned[bones].mean(0)
     wanted = _SkinBefore.of(aligned, parts.skin, middle, aligned[bones])
@@ -213,12 +217,17 @@ def _fitted(aligned: Tensor, found: Tensor, bones: Tensor, parts: InnerParts, li
     use = wanted.met & (wanted.thickness < (float(thin.quantile(_THIN)) if len(thin) else 0.0) + _THICKER)
     around = parts.skin[wanted.triangle[use]].unique()
     across, up, front = _TRANSLATION_DEVIATION
-    if lip is not None:
-        around, up = lip, _LIP_DEVIATION
-    elif len(around) < _MIN_VERTICES:
+    if len(around) < _MIN_VERTICES:
         around = parts.skin.unique()
+    moved = found - aligned
+    shift = moved[around].mean(0)
+    if lips is not None:
+        skin, (lip, lower) = shift[1], moved[lips]
+        shift, up = lip.clone(), _LIP_DEVIATION
+        if float(lip[1] - lower[1]) > _PARTED:  # a raised lip is not short, and a jaw that drops takes no upper teeth
+            shift[1] = torch.stack([lip[1], skin, torch.zeros_like(skin)]).median()
     # Lids show little of an eyeball's size and nothing of its rotation: both are the whole head's.
-    centre = middle + (found - aligned)[around].mean(0)
+    centre = middle + shift
     offsets = aligned[bones[use]] - middle
     state = torch.zeros(4, dtype=torch.float64)
     prior = 1 / torch.tensor([across, up, front, _SCALE_DEVIATION], dtype=torch.float64).square()
