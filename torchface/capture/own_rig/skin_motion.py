@@ -53,7 +53,7 @@ _VARIES = {
 _USUALLY = 0.075
 _POSE = (2.0, 2.0, 0.03, 0.03, 0.06, 0.06)
 _UNSEEN = ("eyeBlink", "eyeLook", "tongue")
-# Deviation of a mean error; frames that err together; below 0, for skin goes beyond a rig's shapes.
+# Deviation of a mean error; frames that err together; how far below 0 weights go, for skin goes beyond rigs' shapes.
 _LIFT, _LASTS, _BEYOND = 0.2, 10.0, 0.1
 
 
