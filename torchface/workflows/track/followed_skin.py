@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 
+import torch
 from torch import Tensor
 
 from torchface.capture.antagonist_shapes import signed_difference, signed_quantities
@@ -39,5 +40,7 @@ def followed_weights(
         return solution.weights
     window = calm_window(clip.fps, count)
     calm = motion if window is None else replace(motion, change=savitzky_golay(motion.change, window))
-    weights = calm.applied(solution.weights, resting)
-    return signed_difference(weights, signed_quantities(rig.names).to(weights.device))
+    weights, signed = calm.applied(solution.weights, resting), signed_quantities(rig.names).to(solution.weights)
+    # Skin does not show blinks: where one is solved, its lid does not rise.
+    shut = ((solution.weights * ~motion.deviation.isfinite()) > 0).to(signed) @ signed.abs().T @ signed.abs() > 0
+    return torch.where(shut, solution.weights, signed_difference(weights, signed))

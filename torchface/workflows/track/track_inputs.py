@@ -25,7 +25,7 @@ from torchface.workflows.named_priors import DEFAULT_PRIOR
 from torchface.workflows.track.track_models import DEFAULT_LANDMARKS, TrackModels, is_table, load_track_models
 from torchface.workflows.track.upright_rig import upright
 
-METHOD = "track/16"
+METHOD = "track/17"
 """Of the keys; another number where the same inputs, or pieces of another length, come to give other results."""
 
 Overlay = Literal["side", "over", "none"]
