@@ -14,8 +14,9 @@ import torch
 from torch import Tensor
 
 from torchface.capture.own_rig import skin_motion as module
+from torchface.capture.own_rig.flat_face import FlatFace
 from torchface.capture.own_rig.head_pose import measure_poses
-from torchface.capture.own_rig.skin_motion import FlatFace, SkinMotion, skin_motion
+from torchface.capture.own_rig.skin_motion import SkinMotion, skin_motion
 from torchface.correctives.corrective_shapes import Corrective, Correctives
 from torchface.errors import FileFormatError
 from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
@@ -41,7 +42,7 @@ class Film:
 
 
 class FullFile(BytesIO):
-    """A file on a disk that has room for 1000 bytes."""
+    """A file on a disk that holds 1000 bytes."""
 
     def write(self, values: Any) -> int:
         if self.tell() >= 1000:
@@ -179,7 +180,7 @@ def test_a_temporary_folder_that_is_full_is_said(
 ) -> None:
     shown = torch.ones(FRAMES, dtype=torch.bool)
     monkeypatch.setattr(module, "TemporaryFile", lambda **_: FullFile())
-    with pytest.raises(FileFormatError, match=r"no room \(No space left on device\).* 12 frames, expected 0\.\d MB"):
+    with pytest.raises(FileFormatError, match=r"no space \(No space left on device\).* 12 frames, expected 0\.\d MB"):
         skin_motion(rig, filmed.pictures, planted(rig.names), filmed.poses, shown, filmed.camera, part_of("skin"))
 
 

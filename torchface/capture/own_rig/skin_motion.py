@@ -16,23 +16,17 @@ import torch
 from torch import Tensor
 
 from torchface.capture.own_rig.eye_geometry import arkit_names
+from torchface.capture.own_rig.flat_face import FlatFace, softened
 from torchface.errors import FileFormatError
 from torchface.geometry.cameras.calibration import CameraCalibration
-from torchface.geometry.cameras.distortion import distort
-from torchface.geometry.meshes.operators import vertex_normals
 from torchface.landmarks.images.networks.part_finder import PartFinder
-from torchface.rendering.raycast import RayCaster
 from torchface.rig import BlendshapeRig
 
 LEAST_FRAMES = 10
 """Frames that show the face from which their mean is a reference."""
 
-_ABOVE, _INSIDE = 22.0, 2.0  # millimetres above the brows, and within the jaw's landmarks, that are laid flat
 _FINEST, _COARSEST = 1.0, 1.5  # millimetres a pixel of it
-_OPENINGS = ((slice(36, 42), 3.0), (slice(42, 48), 3.0), (slice(60, 68), 1.0))  # landmarks, and millimetres around them
-_SQUARELY, _FULLY = 0.3, 0.6  # cosines of the view from which skin begins to count, and counts fully
 _EDGE = 2  # pixels beside what is not seen that do not count
-_EVEN, _LOCAL, _DARK, _CONTRAST = 12.0, 20.0, 3.0, 40.0  # millimetres, millimetres, grey levels, grey levels
 _SAMPLES, _ROUNDS = 40, 2  # frames of the reference, and how often they are brought onto it
 _LOOKED_AT, _COVERED = 10, 0.2  # frames in which parts are found, and the share of what covers skin that is too much
 _LEAST_PLACES = 1000  # of skin: a tenth of a face
@@ -55,81 +49,6 @@ _POSE = (2.0, 2.0, 0.03, 0.03, 0.06, 0.06)
 _UNSEEN = ("eyeBlink", "eyeLook", "tongue")
 # Deviation of a mean error; frames that err together; how far below 0 weights go, for skin goes beyond rigs' shapes.
 _LIFT, _LASTS, _BEYOND = 0.2, 10.0, 0.1
-
-
-@dataclass(frozen=True, eq=False)
-class FlatFace:
-    """The face of a rig as somebody before it sees it: H rows of W places on it, and what N shapes move them by."""
-
-    rest: Tensor  # (H,W,3), millimetres
-    basis: Tensor  # (N,H,W,3), millimetres
-    acting: Callable[[Tensor], Tensor]  # places (H,W,3) at weights (N,), with the rig's correctives
-    normals: Tensor  # unit, (H,W,3)
-    counts: Tensor  # where there is skin: no eye, no inside of the mouth, (H,W) bool
-    landmarks: Tensor  # their nearest places, row and column, (68,2) int64
-    step: float  # millimetres a pixel
-
-    @staticmethod
-    def of(rig: BlendshapeRig, step: float) -> "FlatFace":
-        """Of an upright rig in millimetres with iBUG's 68 landmarks."""
-        vertices, faces = rig.vertices.detach().double(), rig.neutral.faces
-        marks = vertices[rig.neutral.landmarks]
-        jaw, brows = marks[:17], marks[17:27]
-        x = torch.arange(float(jaw[:, 0].min()) + _INSIDE, float(jaw[:, 0].max()) - _INSIDE, step).double()
-        y = torch.arange(float(brows[:, 1].max()) + _ABOVE, float(jaw[:, 1].min()) + _INSIDE, -step).double()
-        ahead = torch.stack([*torch.meshgrid(x, y, indexing="xy"), vertices[:, 2].max().expand(len(y), len(x))], dim=-1)
-        way = torch.tensor([0.0, 0.0, -1.0]).double().expand(ahead.numel() // 3, 3)
-        hits = RayCaster(vertices, faces).cast(ahead.flatten(0, 1) - way, way)
-        corners, shares = faces[hits.triangle.clamp(min=0)], hits.barycentric.double()[..., None]
-
-        def there(values: Tensor) -> Tensor:
-            return (values.detach().double()[corners] * shares).sum(1).float().unflatten(0, ahead.shape[:2])
-
-        skin = (hits.triangle >= 0).unflatten(0, ahead.shape[:2]).numpy().astype(np.uint8)
-        for rows, around in _OPENINGS:
-            cv2.fillConvexPoly(skin, _grown(marks[rows, :2], around, x, y), 0)
-        normals = torch.nn.functional.normalize(there(vertex_normals(vertices, faces)), dim=-1)
-        skin = cv2.erode(skin, np.ones((3, 3), np.uint8))
-        basis = torch.stack([there(delta) for delta in rig.deltas])
-        nearest = torch.stack([(marks[:, 1] - y[0]) / -step, (marks[:, 0] - x[0]) / step], dim=-1).round().long()
-        nearest = nearest.clamp(min=0).minimum(torch.tensor(skin.shape) - 1)
-
-        def acting(weights: Tensor) -> Tensor:
-            return there(rig(weights[None])[0])
-
-        return FlatFace(there(vertices), basis, acting, normals, torch.from_numpy(skin) > 0, nearest, step)
-
-    def seen_in(
-        self, frame: Tensor, weights: Tensor, pose: tuple[Tensor, Tensor], calibration: CameraCalibration
-    ) -> tuple[np.ndarray, np.ndarray, Tensor]:
-        """What a frame, uint8 (3,h,w), shows at the places, grey (H,W), with weights (N,) and a pose (3,3), (3,); how
-        squarely, (H,W) in [0,1], 0 beyond the frame; and where, (H,W,2) pixels."""
-        rotation, translation = pose
-        places = self.acting(weights) @ rotation.T + translation
-        image = places @ calibration.intrinsics.to(places).T
-        at = image[..., :2] / image[..., 2:]
-        at = distort(at, calibration) if calibration.distortion.any() else at
-        towards = torch.nn.functional.normalize(-places, dim=-1)
-        cosine = ((self.normals @ rotation.T) * towards).sum(-1)
-        last = torch.tensor([frame.shape[2], frame.shape[1]]) - 1
-        there = (places[..., 2] > 0) & ((at >= 0) & (at <= last)).all(-1)
-        seen = ((cosine - _SQUARELY) / (_FULLY - _SQUARELY)).clamp(0, 1).where(there, 0.0)
-        first, end = at.flatten(0, 1)[there.flatten()].aminmax(dim=0) if there.any() else (0 * last, last)
-        (left, top), (right, bottom) = first.long().tolist(), (end.long() + 2).tolist()
-        grey = cv2.cvtColor(frame[:, top:bottom, left:right].permute(1, 2, 0).contiguous().numpy(), cv2.COLOR_RGB2GRAY)
-        x, y = at[..., 0].numpy() - left, at[..., 1].numpy() - top
-        return cv2.remap(grey, x, y, cv2.INTER_LINEAR), seen.numpy(), at
-
-    def landmarks_in(self, at: Tensor) -> Tensor:
-        """Landmarks (68,2) where places are at (H,W,2)."""
-        return at[self.landmarks[:, 0], self.landmarks[:, 1]]
-
-    def even(self, picture: np.ndarray) -> np.ndarray:
-        """A picture (H,W) of it without light that is alike all around, and of one contrast, uint8."""
-        grey = picture.astype(np.float32)
-        detail = grey - _soft(grey, _EVEN / self.step)
-        contrast = _soft(np.abs(detail), _LOCAL / self.step) + _DARK
-        return np.clip(128 + _CONTRAST * detail / contrast, 0, 255).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,7 +166,7 @@ def _append(file: BinaryIO, pictures: np.ndarray, frames: int) -> None:
             left = left[file.write(left) :]
     except OSError as error:
         raise FileFormatError(
-            f"{gettempdir()}: found no room ({error.strerror}) for a temporary file of the skin in {frames} frames, "
+            f"{gettempdir()}: found no space ({error.strerror}) for a temporary file of the skin in {frames} frames, "
             f"expected {frames * pictures.nbytes / 1e6:,.1f} MB; free some, or name a folder on another disk as TMPDIR"
         ) from error
 
@@ -278,7 +197,7 @@ class _Fit:
         basis = face.basis[shapes].numpy()[:, places]
         moves = np.concatenate([np.stack([basis[..., 0], -basis[..., 1]]), pose], axis=1)
         slopes = (cv2.Sobel(reference, cv2.CV_32F, *way, scale=1 / 8) for way in ((1, 0), (0, 1)))
-        strong = [_soft(slope**2, 2.0) for slope in slopes]
+        strong = [softened(slope**2, 2.0) for slope in slopes]
         across, up = ((one / (one + _PLAIN))[places] for one in strong)
         varies = [
             next((off for start, off in _VARIES.items() if called[row].startswith(start)), _USUALLY) for row in shapes
@@ -294,7 +213,7 @@ class _Fit:
         flow = _flow(self.reference, picture)
         other = np.abs(_moved(picture, flow).astype(np.float32) - self.reference)
         counts = cv2.erode(squarely * (self.skin / 255), np.ones((2 * _EDGE + 1,) * 2, np.uint8))
-        counts = (counts / (1 + (_soft(other, 2.0) / _OTHER) ** 4))[self.places]
+        counts = (counts / (1 + (softened(other, 2.0) / _OTHER) ** 4))[self.places]
         across, up = self.contrast
         return self.step * flow[self.places].T.ravel(), np.concatenate([counts * across, counts * up])
 
@@ -338,16 +257,3 @@ def _moved(picture: np.ndarray, flow: np.ndarray) -> np.ndarray:
     """A picture (H,W) brought back along a flow from the reference."""
     y, x = np.indices(picture.shape, dtype=np.float32)
     return cv2.remap(picture, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-
-
-def _soft(picture: np.ndarray, deviation: float) -> np.ndarray:
-    return cv2.GaussianBlur(picture, (0, 0), deviation)
-
-
-def _grown(outline: Tensor, by: float, x: Tensor, y: Tensor) -> np.ndarray:
-    """The hull of landmarks (M,2), grown by some millimetres, in pixels of places x (W,) and y (H,) falling, int32."""
-    hull = cv2.convexHull(outline.numpy().astype(np.float32))[:, 0]
-    out = hull - hull.mean(0)
-    hull = hull + by * out / np.linalg.norm(out, axis=1, keepdims=True)
-    step = float(x[1] - x[0])
-    return np.round(np.stack([hull[:, 0] - float(x[0]), float(y[0]) - hull[:, 1]], axis=1) / step).astype(np.int32)
