@@ -26,8 +26,9 @@ def largest_eigenpairs(matrix: Tensor, count: int | None = None) -> tuple[Tensor
         ([3.0, 2.0], [0.0, 1.0, 0.0])
     """
     size = len(matrix)
-    subset = None if count is None or count >= size else (size - count, size - 1)
+    count = size if count is None else min(count, size)
+    # Of more than a quarter, all are found sooner.
+    subset = (size - count, size - 1) if 4 * count <= size else None
     values, vectors = eigh(matrix.detach().cpu().double().numpy(), lower=True, subset_by_index=subset)
-    return torch.from_numpy(values[::-1].copy()).to(matrix.device), torch.from_numpy(vectors[:, ::-1].copy()).to(
-        matrix.device
-    )
+    found = values[::-1][:count].copy(), vectors[:, ::-1][:, :count].copy()
+    return torch.from_numpy(found[0]).to(matrix.device), torch.from_numpy(found[1]).to(matrix.device)

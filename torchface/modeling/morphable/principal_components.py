@@ -17,7 +17,7 @@ from torchface.optim.eigenpairs import largest_eigenpairs
 from torchface.progress import Progress, silent
 
 _BLOCK_BYTES = 2**27
-_ROWS = 64  # of a block's product with itself, of which only the lower triangle is formed
+_COLUMNS = 2048  # of a block that fit in a processor's cache, for all of its samples
 _WHOLE_SPECTRUM = 1500
 _MAX_COMPONENTS = 200
 _GRAM_SAMPLES = 4000  # above, time and memory of the Gram matrix grow past those of passes over the samples
@@ -35,7 +35,7 @@ class PrincipalComponents:
     """The mean of samples and the directions in which they vary, what a linear Gaussian model learns."""
 
     mean: Tensor  # (D,) float64
-    components: Tensor  # orthonormal rows (K,D) float64, the one that varies most first
+    components: Tensor  # orthonormal rows (K,D), the one that varies most first; summed in float64
     standard_deviations: Tensor  # of the samples along them, (K,) float64
     total_variance: float  # of the samples, all D dimensions summed, whether a component holds it or not
 
@@ -95,25 +95,28 @@ def principal_components(
         for first, last in parts[:number]:
             gram[begin:end, first:last] = block @ _centred(samples, first, last, mean).T
             step()
-        for row in range(0, end - begin, _ROWS):
-            upper = min(row + _ROWS, end - begin)
-            gram[begin + row : begin + upper, begin : begin + upper] = block[row:upper] @ block[:upper].T
+        # NumPy forms one triangle of a product of this kind and copies it, in half of torch's time.
+        gram[begin:end, begin:end] = torch.from_numpy(block.numpy() @ block.numpy().T)
         step()
         rows.write(number, gram[begin:end, :end])
     trace = float(gram.diagonal().sum())
     values, vectors = largest_eigenpairs(gram, most)
     rank = _rank(values, floor, count)
     values, vectors = values[:rank], vectors[:, :rank]
-    toward = (vectors / values.sqrt()).T.contiguous()
+    toward = (vectors / values.sqrt()).T.numpy()
     del gram, vectors
-    components = torch.zeros(rank, vertices * channels, dtype=torch.float64)
+    # What is summed over several blocks stays in float64.
+    components = np.empty((rank, vertices * channels), np.float32 if len(parts) == 1 else np.float64)
     for begin, end in parts:
         if block is None or len(parts) > 1:
             block = _centred(samples, begin, end, mean)
-        components.addmm_(toward[:, begin:end], block)
+        for column in range(0, vertices * channels, _COLUMNS):
+            columns = slice(column, column + _COLUMNS)
+            product = toward[:, begin:end] @ block.numpy()[:, columns]
+            components[:, columns] = product if begin == 0 else components[:, columns] + product
         step()
     rows.remove()
-    return _learned(mean, components, values, trace, count)
+    return _learned(mean, torch.from_numpy(components), values, trace, count)
 
 
 def _by_passes(
@@ -142,7 +145,7 @@ def _by_passes(
 
 def _learned(mean: Tensor, components: Tensor, values: Tensor, trace: float, count: int) -> PrincipalComponents:
     """The components (K,D) with their signs settled, of eigenvalues (K,) of the scatter matrix of so many samples."""
-    weights = torch.arange(components.shape[1], dtype=torch.float64).cos()
+    weights = torch.arange(components.shape[1], dtype=torch.float64).cos().to(components)
     components = components.mul_(torch.where(components @ weights < 0, -1.0, 1.0).to(components)[:, None])
     return PrincipalComponents(mean, components, (values / (count - 1)).sqrt(), trace / (count - 1))
 
@@ -169,7 +172,8 @@ def _mean(
             bad = (~torch.isfinite(part)).any(1).nonzero()[:, 0] + begin
             raise ValueRangeError(f"samples: number {int(bad[0])} holds NaN or infinity; expected none")
         total = summed if total is None else total + summed
-        largest, eps = max(largest, float(part.max()), -float(part.min())), torch.finfo(part.dtype).eps
+        least, most = part.aminmax()
+        largest, eps = max(largest, float(most), -float(least)), torch.finfo(part.dtype).eps
         if keyed:
             contents.append(content_key(_METHOD, block=part))
         step()
@@ -178,7 +182,7 @@ def _mean(
 
 
 def _centred(samples: Samples, begin: int, end: int, mean: Tensor) -> Tensor:
-    return samples.read(begin, end).flatten(1).to(torch.float64, copy=True).sub_(mean)
+    return torch.from_numpy(np.subtract(samples.read(begin, end).flatten(1).numpy(), mean.numpy()))
 
 
 class _Rows:
