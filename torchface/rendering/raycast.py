@@ -34,7 +34,7 @@ class RayCaster:
         used[faces.flatten()] = True
         rows = (used.cumsum(0) - 1).to(torch.int32)[faces]
         centred = (vertices.double() - self._centre)[used.to(vertices.device)].float().cpu().numpy()
-        TriangleMesh(self._scene, np.ascontiguousarray(centred), rows.cpu().numpy())
+        TriangleMesh(self._scene, centred.astype(object), rows.cpu().numpy().astype(object))  # it reads Python's sooner
 
     def cast(self, origins: Tensor, directions: Tensor) -> Hits:
         """The first hit of each ray; origins and unit directions (R,3)."""

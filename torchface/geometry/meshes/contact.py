@@ -61,7 +61,11 @@ class ContactFinder:
         near = points[pool[moved[pool]]]
         inside = (points[pool] >= near.min(0) - reach) & (points[pool] <= near.max(0) + reach)
         pool = pool[inside.all(1)]
-        tree = cKDTree(points[pool], balanced_tree=False, compact_nodes=False)
+        places = points[pool]
+        if not self._named:  # a fourth coordinate holds the parts apart, of which only vertices of one meet
+            pool = pool[np.isin(self._part[pool], np.unique(self._part[moved]))]
+            places = np.column_stack([points[pool], 2 * reach * self._part[pool]])
+        tree = cKDTree(places, balanced_tree=False, compact_nodes=False)
         i, j = pool[tree.query_pairs(reach, output_type="ndarray")].T
         keep = moved[i] | moved[j]
         i, j = i[keep], j[keep]
@@ -70,8 +74,11 @@ class ContactFinder:
             i, j = np.where(swap, j, i), np.where(swap, i, j)
             keep = self._first[i] & self._second[j]
         else:
-            normals = vertex_normals(vertices, self._faces).numpy()
-            keep = ((normals[i] * normals[j]).sum(1) < 0) & (self._part[i] == self._part[j])
+            considered = torch.zeros(len(points), dtype=torch.bool)
+            considered[pool] = True
+            around = self._faces[considered[self._faces].any(1)]
+            normals = vertex_normals(vertices, around).numpy()
+            keep = np.einsum("kc,kc->k", normals[i], normals[j]) < 0
         i, j = i[keep], j[keep]
         if not self._named and len(i):
             ring = self._rings[rings]
