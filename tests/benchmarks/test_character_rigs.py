@@ -20,8 +20,6 @@ from torchface import BlendshapeRig, load_rig
 from torchface.geometry.rotations import rotation_matrix
 from torchface.synthetic import draw_identities, performer
 
-SECONDS, FINDING = 60.0, 10.0  # on two quiet cores
-
 
 def person() -> BlendshapeRig:
     return performer(draw_identities(1, torch.Generator().manual_seed(3))[0], texture=False)
