@@ -72,7 +72,7 @@ class TrainingSettings:
         levels: of intensity, the lowest of them rest.
         variance: fraction of the features' variance that the principal components explain.
         penalty: of the support vector machines.
-        warps: replicas of every frame, each warped at random.
+        warps: replicas of every frame, each warped at random: faces and paint of others differ so.
         warp_amplitude: of their control points, pixels.
         seed: of k-means and the warps.
 
@@ -84,7 +84,7 @@ class TrainingSettings:
     levels: int = 4
     variance: float = 0.9
     penalty: float = 10.0
-    warps: int = 0
+    warps: int = 1
     warp_amplitude: float = 0.8
     seed: int = 0
 
