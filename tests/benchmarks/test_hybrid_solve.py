@@ -1,7 +1,7 @@
 """The hybrid solve where markers are blind: errors against the markers alone, jerk, frames side by side.
 
-Films a performer who trains the classifier, and takes of that performer and of another, which takes minutes; the films
-stay in ``out/hybrid/films`` for the next run.
+The classifier learns from the first film of ``test_action_units``. Films takes of that performer and of another, which
+takes minutes; the films stay in ``out/hybrid/films`` for the next run.
 """
 
 from dataclasses import dataclass
@@ -10,15 +10,15 @@ from pathlib import Path
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from test_action_units import film as action_unit_film
+from test_action_units import regions
 from torch import Tensor
 
 from torchface import Attachment, BlendshapeRig, Take, load_take, zoo
 from torchface.capture import ActionUnitClassifier, CurveSettings, HybridSolver, MarkerSolver, align_take
-from torchface.capture.action_units import GROUPS, ActionUnitCurves, action_unit_curves, load_shape_table, read_regions
-from torchface.capture.action_units.classifier import group_regions
+from torchface.capture.action_units import ActionUnitCurves, action_unit_curves, load_shape_table
 from torchface.capture.markers import gamma_curves, rest_residual
 from torchface.io.action_labels import ActionLabels, load_action_labels
-from torchface.io.video import open_video
 from torchface.synthetic import draw_identities, performer
 from torchface.synthetic.stages.marker_stage import StageFlaws
 from train.filmed_performers.action_performance import MOVES, PerformanceSettings
@@ -80,12 +80,13 @@ def upper_layout(rig: BlendshapeRig, upper: int = 54, lower: int = 12) -> Attach
     return spots.select([*above[:upper], *below[:lower], *SIDE_MARKERS])
 
 
-def film(name: str, number: int, seed: int, attachment: Attachment | None, settings: StageSettings) -> Film:
+def film(name: str, number: int, seed: int, attachment: Attachment) -> Film:
     folder = OUT / "films"
     folder.mkdir(parents=True, exist_ok=True)
     truth, sites = folder / f"{name}.safetensors", folder / f"{name}.json"
     if not truth.is_file():
         generator = torch.Generator().manual_seed(seed)
+        settings = StageSettings(marker_flaws=FLAWS, performance=TAKE)
         session = record_session(folder, name, identity(number), generator, settings, attachment=attachment)
         session.attachment.save(sites)
         save_file({"weights": session.performance.weights}, truth)
@@ -100,18 +101,12 @@ def film(name: str, number: int, seed: int, attachment: Attachment | None, setti
     )
 
 
-def training_film() -> Film:
-    return film("training", 0, 100, None, StageSettings())
-
-
 def blind_film(number: int) -> Film:
-    layout = blind_layout(performer(identity(number)))
-    return film(f"blind{number}", number, 200 + number, layout, StageSettings(marker_flaws=FLAWS, performance=TAKE))
+    return film(f"blind{number}", number, 200 + number, blind_layout(performer(identity(number))))
 
 
 def upper_film() -> Film:
-    layout = upper_layout(performer(identity(0)))
-    return film("upper", 0, 300, layout, StageSettings(marker_flaws=FLAWS, performance=TAKE))
+    return film("upper", 0, 300, upper_layout(performer(identity(0))))
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,9 +121,8 @@ class Solved:
 
 @pytest.fixture(scope="module")
 def classifier() -> ActionUnitClassifier:
-    one = training_film()
-    regions = read_regions(open_video(one.video), one.labels, group_regions(GROUPS))
-    return ActionUnitClassifier.fit([regions], [one.labels])
+    one = action_unit_film(0)
+    return ActionUnitClassifier.fit([regions(one)], [one.labels])
 
 
 def solved(classifier: ActionUnitClassifier, one: Film, units: tuple[str, ...] | None, at_rest: bool = True) -> Solved:
