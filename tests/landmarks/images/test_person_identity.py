@@ -71,6 +71,18 @@ def test_one_alone_who_turned_or_was_lit_otherwise_while_lost_is_found(
     assert not bool(is_other(state, here[:3], turned, STEP))
 
 
+def test_who_turns_back_where_a_picture_on_the_wall_looks_like_a_face_is_found() -> None:
+    known, turned = (face_look(one) for one in colors(2, seed=4))
+    picture = torch.tensor([60.0, 80.0, 60.0, 0.6])
+    state = after_boxes(alone(known), boxes(OWN, picture), YES, STEP)
+    state = after_face(state, OWN[:3], known, (YES, NO), STEP)
+    for _ in range(10):
+        state = after_boxes(state, boxes(picture), YES, STEP)
+    state = after_boxes(state, boxes(OWN, picture), YES, STEP)
+    assert not bool(is_other(state, OWN[:3], turned, STEP))
+    assert bool(is_other(state, picture[:3], turned, STEP))
+
+
 def alone(look: Tensor) -> Tensor:
     """What is known of one person after ten frames."""
     state = torch.zeros(IDENTITY)

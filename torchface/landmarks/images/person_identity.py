@@ -115,7 +115,10 @@ def is_other(identity: Tensor, place: Tensor, look: Tensor, interval: Tensor) ->
     # Who looks otherwise is somebody else, if one is known or was seen where the first one was not; else the first one
     # has turned, or the light is another.
     somebody = _is_known(identity) | ((own[2] > 0) & elsewhere)
-    theirs = (_is_known(identity) & nearer) | (somebody & hidden & (likeness < _STRANGE))
+    # Who is where the first one was, while the other is seen elsewhere, is the first one, turned.
+    seen_now = _is_known(identity) & (other[5] <= 0.5 * interval)
+    back = seen_now & (_apart(other, place[:2]) > _AROUND) & (_apart(own, place[:2]) < _BEFORE)
+    theirs = (_is_known(identity) & nearer) | (somebody & hidden & (likeness < _STRANGE) & ~back)
     return theirs & (from_own > torch.where(hidden, 0.0, _SURE)) & (own[5] < _FORGOTTEN)
 
 
