@@ -75,7 +75,7 @@ def filmed(data: Path) -> list[Filmed]:
     shots = []
     for name, scene in scenes.items():
         clip = webcam_film(scene, sources, KEPT)
-        shots.append(Filmed(name, clip, read_faces(clip.frames(), FPS, KEPT)))
+        shots.append(Filmed(name, clip, read_faces(clip.frames(), FPS)))
     return shots
 
 

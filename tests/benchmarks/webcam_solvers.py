@@ -4,12 +4,10 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from pathlib import Path
 
 import numpy as np
 import onnxruntime
 import torch
-from safetensors.torch import load_file, save
 from torch import Tensor
 
 from planted.webcam_solver_file import webcam_solver_model
@@ -25,8 +23,6 @@ from torchface.capture.anybody import (
 )
 from torchface.capture.anybody.examples.example_methods import ExampleMethod
 from torchface.capture.own_rig import VideoState
-from torchface.files.content_keys import content_key
-from torchface.files.whole_files import write_file
 from torchface.geometry.cameras.calibration import assumed_calibration
 from torchface.landmarks.images.face_reading import READ_FOR_SOLVER, FaceReading
 from torchface.landmarks.images.frame_reader.face_reader import STATE, FaceReader
@@ -54,21 +50,15 @@ Solver = Callable[[list[FaceReading], float, tuple[int, int]], Solved]
 """Solves readings of a video with so many frames a second, pixels wide and high."""
 
 
-def read_faces(frames: Tensor, fps: float, kept: Path) -> list[FaceReading]:
-    """What the shipped networks read of a face in frames uint8 (T,3,H,W), as in a webcam's model; kept in a folder."""
+def read_faces(frames: Tensor, fps: float) -> list[FaceReading]:
+    """What the shipped networks read of a face in frames uint8 (T,3,H,W), as in a webcam's model."""
     reader = FaceReader(webcam_networks()).eval()
-    key = content_key("faces read/5", reader=reader, frames=frames, fps=fps)[:16]
-    path = kept / f"{key}.safetensors"
-    if not path.is_file():
-        state, rows = torch.zeros(STATE), []
-        for frame in frames:  # a frame's place is the next one's
-            with torch.inference_mode():
-                reading, state = reader(frame.permute(1, 2, 0), torch.tensor(1 / fps), state)
-            rows.append(reading)
-        taken = FaceReading.stacked(rows)
-        write_file(path, save({name: getattr(taken, name).clone() for name in READ_FOR_SOLVER}))
-    stored = load_file(path)
-    return [FaceReading(**{name: values[row] for name, values in stored.items()}) for row in range(len(frames))]
+    state, rows = torch.zeros(STATE), []
+    for frame in frames:  # a frame's place is the next one's
+        with torch.no_grad():
+            reading, state = reader(frame.permute(1, 2, 0), torch.tensor(1 / fps), state)
+        rows.append(reading)
+    return rows
 
 
 def _one_thread() -> onnxruntime.SessionOptions:
