@@ -17,6 +17,7 @@ from test_photographed_scan import face_error, upright
 from torch import Tensor
 
 from torchface import load_rig, load_take, zoo
+from torchface.capture.anybody.skin_follower import SkinFollower
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.modeling.photographs import multiple_views
 from torchface.rendering.clay_shading import render
@@ -82,7 +83,10 @@ def test_a_scan_that_acts(
     torch.set_num_threads(1)
     truth = acted(data, ict_folder, tmp_path, number, first)
     film, rows = tmp_path / "film.mp4", {}
-    for name, method in {"MediaPipe": mediapipe(data / "peers" / "face_landmarker.task"), "live": live}.items():
+    with monkeypatch.context() as unfollowed:
+        unfollowed.setattr(SkinFollower, "followed", lambda _, picture, state, *__: state.weights)
+        rows["live, landmarks alone"] = figures(live(Clip(film))[0], truth)
+    for name, method in {"live": live, "MediaPipe": mediapipe(data / "peers" / "face_landmarker.task")}.items():
         rows[name] = figures(method(Clip(film))[0].nan_to_num(0.0).float(), truth)
     mesh, places = upright(data)
     scan, heads = trimesh.Trimesh(mesh.vertices.double().numpy(), mesh.faces.numpy(), process=False), {}

@@ -1,9 +1,6 @@
 """Skin that moves: weights by how the face, laid flat, differs from frame to frame."""
 
 import errno
-import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -11,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
+from planted.skin_films import FRAMES, HEIGHT, MOVED, WIDTH, Film, film_of, part_of, planted
 from torchface.capture.own_rig import skin_motion as module
 from torchface.capture.own_rig.flat_face import FlatFace
 from torchface.capture.own_rig.head_pose import measure_poses
@@ -22,23 +19,8 @@ from torchface.errors import FileFormatError
 from torchface.geometry.cameras.calibration import CameraCalibration, assumed_calibration
 from torchface.geometry.cameras.pinhole import look_at
 from torchface.io.video import open_video
-from torchface.landmarks.images.networks.part_finder import FaceParts
-from torchface.landmarks.images.networks.part_network import PARTS
-from torchface.rendering.clay_shading import render
 from torchface.rig import BlendshapeRig
 from torchface.synthetic import performer
-
-FRAMES, WIDTH, HEIGHT = 12, 220, 260
-MOVED = ("browInnerUp", "browOuterUpLeft", "mouthSmileRight", "noseSneerLeft")
-
-
-@dataclass(frozen=True, eq=False)
-class Film:
-    """Pictures of the performer, who turns."""
-
-    pictures: list[Tensor]
-    poses: tuple[Tensor, Tensor]
-    camera: CameraCalibration
 
 
 class FullFile(BytesIO):
@@ -50,48 +32,14 @@ class FullFile(BytesIO):
         return super().write(values[:1000])
 
 
-def part_of(part: str) -> Callable[[Tensor, Tensor], FaceParts]:
-    """What takes whole pictures for one part."""
-
-    def find(image: Tensor, landmarks: Tensor) -> FaceParts:
-        shares = torch.zeros(len(PARTS), 8, 8)
-        shares[PARTS.index(part)] = 1
-        return FaceParts(shares, torch.tensor([[8 / image.shape[-1], 0, 0], [0, 8 / image.shape[-2], 0]]).double())
-
-    return find
-
-
 @pytest.fixture(scope="module")
 def rig() -> BlendshapeRig:
     return performer()
 
 
-def planted(names: Sequence[str]) -> Tensor:
-    """Weights (T,N) of which each of ``MOVED`` rises and falls in its own time."""
-    phase = torch.linspace(0, 2 * torch.pi, FRAMES + 1)[:-1]
-    weights = torch.zeros(FRAMES, len(names))
-    for number, name in enumerate(MOVED):
-        weights[:, names.index(name)] = 0.25 + 0.25 * (phase * (1 + number // 2) + number).sin()
-    return weights
-
-
 @pytest.fixture(scope="module")
 def filmed(rig: BlendshapeRig) -> Film:
     return film_of(rig)
-
-
-def film_of(rig: BlendshapeRig) -> Film:
-    middle = rig.vertices[rig.neutral.landmarks[17:]].detach().double().mean(0)
-    cameras = [look_at(middle, 12.0 * math.sin(0.5 * frame), 4.0, 260.0, WIDTH, HEIGHT) for frame in range(FRAMES)]
-    pictures = [
-        (255 * render(rig.neutral.with_vertices(vertices), camera)[:3]).byte()
-        for vertices, camera in zip(rig(planted(rig.names)).detach(), cameras, strict=True)
-    ]
-    poses = (
-        torch.stack([camera.rotation for camera in cameras]),
-        torch.stack([camera.translation for camera in cameras]),
-    )
-    return Film(pictures, poses, CameraCalibration(cameras[0].intrinsics, torch.zeros(5).double(), WIDTH, HEIGHT))
 
 
 def test_skin_says_what_weights_lack(rig: BlendshapeRig, filmed: Film) -> None:

@@ -15,10 +15,12 @@ from planted_faces import FRONTAL, JAW, SMILE, Endless, ShadeSolver, a_session, 
 from received_frames import decode_frame
 
 from torchface import load_rig, load_take
-from torchface.capture.anybody import WebcamControls
+from torchface.capture.anybody import WebcamControls, WebcamSettings, WebcamState
+from torchface.capture.anybody.webcam_state import StateLayout
 from torchface.cli import main
 from torchface.errors import ValueRangeError
 from torchface.io.gltf.animation_reading import read_gltf_weights
+from torchface.landmarks.images.frame_reader.face_reader import STATE
 from torchface.progress import silent
 from torchface.shape_names import ARKIT
 from torchface.workflows.browser_app.character import load_character
@@ -170,20 +172,21 @@ def test_the_command_plays_records_and_says_what_is_wrong(
 
 
 class CountingSession:
-    """A session of the webcam's graph whose state counts pictures."""
+    """A session of the webcam's graph whose weights count pictures."""
 
     names = ARKIT
 
     def __init__(self, maker: bytes | str) -> None:
-        self.maker, self.state = maker, 0
+        self.maker, self.state = maker, torch.zeros(STATE + StateLayout(0, WebcamSettings().coefficients).length)
 
-    def resume(self, state: int) -> None:
+    def resume(self, state: torch.Tensor) -> None:
         self.state = state
 
     def step(self, picture: np.ndarray, interval: float) -> SimpleNamespace:
-        self.state += 1
+        self.state = self.state.clone()
+        self.state[STATE : STATE + len(ARKIT)] += 1
         return SimpleNamespace(
-            weights=torch.full((52,), float(self.state)),
+            weights=self.state[STATE : STATE + len(ARKIT)],
             rotation=FRONTAL,
             landmarks=torch.zeros(68, 2),
             iris=torch.zeros(2, 2),
@@ -193,6 +196,17 @@ class CountingSession:
         )
 
 
+class UnseenSkin:
+    """Follows no skin."""
+
+    names = ()
+
+    def followed(self, picture: np.ndarray, state: WebcamState, interval: float, _: WebcamControls) -> torch.Tensor:
+        assert picture.shape == (64, 64, 3)
+        assert interval > 0
+        return state.weights
+
+
 def test_the_first_start_solves_by_pytorch_until_its_graph_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -200,6 +214,7 @@ def test_the_first_start_solves_by_pytorch_until_its_graph_is_made(
     monkeypatch.setattr(live_anybody, "_MAKE", f"import pathlib; pathlib.Path({str(made)!r}).write_bytes(b'graph')")
     monkeypatch.setattr(live_anybody, "kept_webcam_graph", lambda: made.read_bytes() if made.exists() else None)
     monkeypatch.setattr(live_anybody, "webcam_module", lambda: "module")
+    monkeypatch.setattr(live_anybody, "skin_follower", UnseenSkin)
     monkeypatch.setattr(live_anybody, "ModuleSession", CountingSession)
     monkeypatch.setattr(live_anybody, "WebcamSession", CountingSession)
     said: list[str] = []

@@ -17,6 +17,7 @@ from torchface.rig import BlendshapeRig
 _ABOVE, _INSIDE = 22.0, 2.0  # millimetres above the brows, and within the jaw's landmarks, that are laid flat
 _OPENINGS = ((slice(36, 42), 3.0), (slice(42, 48), 3.0), (slice(60, 68), 1.0))  # landmarks, and millimetres around them
 _SQUARELY, _FULLY = 0.3, 0.6  # cosines of the view from which skin begins to count, and counts fully
+_BROAD = 8.0  # pixels
 _EVEN, _LOCAL, _DARK, _CONTRAST = 12.0, 20.0, 3.0, 40.0  # millimetres, millimetres, grey levels, grey levels
 
 
@@ -43,10 +44,13 @@ class FlatFace:
         ahead = torch.stack([*torch.meshgrid(x, y, indexing="xy"), vertices[:, 2].max().expand(len(y), len(x))], dim=-1)
         way = torch.tensor([0.0, 0.0, -1.0]).double().expand(ahead.numel() // 3, 3)
         hits = RayCaster(vertices, faces).cast(ahead.flatten(0, 1) - way, way)
-        corners, shares = faces[hits.triangle.clamp(min=0)], hits.barycentric.double()[..., None]
+        corners = faces[hits.triangle.clamp(min=0)].T.contiguous()
+        shares = hits.barycentric.float().T[..., None].contiguous()
 
         def there(values: Tensor) -> Tensor:
-            return (values.detach().double()[corners] * shares).sum(1).float().unflatten(0, ahead.shape[:2])
+            values = values.detach().float()
+            by_corner = (values.index_select(0, at) * share for at, share in zip(corners, shares, strict=True))
+            return torch.stack(tuple(by_corner)).sum(0).unflatten(0, ahead.shape[:2])
 
         skin = (hits.triangle >= 0).unflatten(0, ahead.shape[:2]).numpy().astype(np.uint8)
         for rows, around in _OPENINGS:
@@ -96,8 +100,13 @@ class FlatFace:
 
 
 def softened(picture: np.ndarray, deviation: float) -> np.ndarray:
-    """A picture (H,W) blurred by a Gaussian of some standard deviation, pixels."""
-    return cv2.GaussianBlur(picture, (0, 0), deviation)
+    """A picture (H,W) blurred by a Gaussian of some standard deviation, pixels; a broad one at a quarter of its size,
+    in a third of the time."""
+    if deviation < _BROAD:
+        return cv2.GaussianBlur(picture, (0, 0), deviation)
+    height, width = picture.shape
+    small = cv2.resize(picture, (-(-width // 4), -(-height // 4)), interpolation=cv2.INTER_AREA)
+    return cv2.resize(cv2.GaussianBlur(small, (0, 0), deviation / 4), (width, height))
 
 
 def _grown(outline: Tensor, by: float, x: Tensor, y: Tensor) -> np.ndarray:

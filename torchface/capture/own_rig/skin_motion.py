@@ -10,13 +10,13 @@ from dataclasses import dataclass, replace
 from tempfile import TemporaryFile, gettempdir
 from typing import BinaryIO
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
-from torchface.capture.own_rig.eye_geometry import arkit_names
-from torchface.capture.own_rig.flat_face import FlatFace, softened
+from torchface.capture.antagonist_shapes import signed_difference, signed_quantities
+from torchface.capture.own_rig.flat_face import FlatFace
+from torchface.capture.own_rig.skin_flow import LEAST_ERROR, SkinFlow, brought_back, optical_flow
 from torchface.errors import FileFormatError
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.landmarks.images.networks.part_finder import PartFinder
@@ -24,29 +24,15 @@ from torchface.rig import BlendshapeRig
 
 LEAST_FRAMES = 10
 """Frames that show the face from which their mean is a reference."""
+LEAST_PLACES = 1000
+"""Of skin: a tenth of a face."""
+COVERS, COVERED = ("glasses", "hand", "cloth", "background"), 0.2
+"""Parts that are no skin, and the share of them from which a place does not count."""
 
 _FINEST, _COARSEST = 1.0, 1.5  # millimetres a pixel of it
-_EDGE = 2  # pixels beside what is not seen that do not count
 _SAMPLES, _ROUNDS = 40, 2  # frames of the reference, and how often they are brought onto it
-_LOOKED_AT, _COVERED = 10, 0.2  # frames in which parts are found, and the share of what covers skin that is too much
-_LEAST_PLACES = 1000  # of skin: a tenth of a face
-_COVERS = ("glasses", "hand", "cloth", "background")
-_PLAIN = 36.0  # squared grey levels a pixel: skin whose contrast is less can hardly be followed
-_OTHER = 20.0  # grey levels by which skin differs that is something else: a hand, hair, a fold
-_TOGETHER = 16  # pixels within which flows err together
-_THIN = 3  # pixels from one that counts to the next
-_LEAST_ERROR, _PILOT_ERROR = 0.3, 0.5  # millimetres of a flow
-_REWEIGHTINGS = 2
-# What a take's solution varies by about its mean error, 1.5 times that of twelve rendered films; brows of real skin are
-# off by more. Places are off by what the pose is: to the sides and up, millimetres, then by turns, radians.
-_VARIES = {
-    "brow": 0.12, "eyeWide": 0.15, "eyeSquint": 0.12, "cheekSquint": 0.11, "noseSneer": 0.08, "mouthSmile": 0.09,
-    "mouthFrown": 0.08, "mouthDimple": 0.045, "mouthStretch": 0.07, "mouthRoll": 0.045, "mouthPress": 0.04,
-    "jawOpen": 0.05, "mouthClose": 0.024, "mouthLeft": 0.045, "mouthRight": 0.045, "jaw": 0.03, "cheekPuff": 0.023,
-}  # fmt: skip
-_USUALLY = 0.075
-_POSE = (2.0, 2.0, 0.03, 0.03, 0.06, 0.06)
-_UNSEEN = ("eyeBlink", "eyeLook", "tongue")
+_LOOKED_AT = 10  # frames in which parts are found
+_PILOT_ERROR = 0.5  # millimetres of a flow
 # Deviation of a mean error; frames that err together; how far below 0 weights go, for skin goes beyond rigs' shapes.
 _LIFT, _LASTS, _BEYOND = 0.2, 10.0, 0.1
 
@@ -81,6 +67,17 @@ class SkinMotion:
             slope = (lift + known * (at_rest + lift)) / _LIFT**2 + precision * below.sum(0)
             lift = lift - slope / ((1 + known) / _LIFT**2 + precision * (below < 0).sum(0))
         return (changed + torch.where(moves, lift, 0.0)).clamp(0, 1)
+
+
+def unless_shut(weights: Tensor, changed: Tensor, names: Sequence[str], unseen: Tensor) -> Tensor:
+    """Weights (...,N) as the skin changed them, one of two antagonists at 0.
+
+    Skin does not show a blink: where one is solved, it stays, and its lid does not rise. ``unseen`` says which shapes
+    those are, (N,) bool.
+    """
+    signed = signed_quantities(names).to(weights)
+    shut = ((weights * unseen) > 0).to(signed) @ signed.abs().T @ signed.abs() > 0
+    return torch.where(shut, weights, signed_difference(changed, signed))
 
 
 def skin_motion(
@@ -137,19 +134,19 @@ def skin_motion(
                 picture, seen, at = face.seen_in(frame, weights[t], (rotation[t], translation[t]), calibration)
                 _append(file, np.stack([face.even(picture), np.round(255 * seen).astype(np.uint8)]), len(rows))
             if t in looked_at:
-                covered += parts(frame, face.landmarks_in(at)).around(at, *_COVERS).nan_to_num(1.0) / len(few)
+                covered += parts(frame, face.landmarks_in(at)).around(at, *COVERS).nan_to_num(1.0) / len(few)
         pictures, squarely = np.memmap(file, np.uint8, "r", shape=(len(rows), 2, *size)).swapaxes(0, 1)
-        face = replace(face, counts=face.counts & (covered < _COVERED))
-        if int(face.counts.sum()) < _LEAST_PLACES:
+        face = replace(face, counts=face.counts & (covered < COVERED))
+        if int(face.counts.sum()) < LEAST_PLACES:
             return None
         reference = _reference(pictures[some], squarely[some])
-        fit = _Fit.of(face, rig.names, reference)
-        samples = [fit.flow(pictures[t], squarely[t]) for t in few]
+        fit = SkinFlow.of(face, rig.names, reference)
+        samples = [fit.flow(pictures[t], squarely[t])[:2] for t in few]
         error = float(np.mean([fit.solved(*sample, _PILOT_ERROR)[2] for sample in samples]))
         change, deviation = torch.zeros(weights.shape), torch.full((len(rig.names),), torch.inf)
         spread = []
         for t, picture, seen in zip(rows.tolist(), pictures, squarely, strict=True):
-            solved = fit.solved(*fit.flow(picture, seen), max(error, _LEAST_ERROR))
+            solved = fit.solved(*fit.flow(picture, seen)[:2], max(error, LEAST_ERROR))
             change[t, fit.shapes] = torch.from_numpy(solved[0]).float()
             spread.append(solved[1])
             done(t)
@@ -171,89 +168,13 @@ def _append(file: BinaryIO, pictures: np.ndarray, frames: int) -> None:
         ) from error
 
 
-@dataclass(frozen=True, eq=False)
-class _Fit:
-    """The least squares of a flow: M shapes and six movements of the pose, at 2G values of G places."""
-
-    reference: np.ndarray  # (H,W) uint8
-    step: float
-    shapes: list[int]  # of the rig's
-    places: np.ndarray  # those that count, (H,W) bool
-    skin: np.ndarray  # (H,W) float32
-    contrast: tuple[np.ndarray, np.ndarray]  # how far a place can be followed to the side and up, (G,) in [0,1]
-    moves: np.ndarray  # (M+6,2G) float32
-    prior: np.ndarray  # precisions, (M+6,)
-
-    @staticmethod
-    def of(face: FlatFace, names: Sequence[str], reference: np.ndarray) -> "_Fit":
-        called = arkit_names(names)
-        shapes = [row for row, name in enumerate(called) if not name.startswith(_UNSEEN)]
-        places = np.zeros_like(reference, dtype=bool)
-        places[::_THIN, ::_THIN] = face.counts.numpy()[::_THIN, ::_THIN]
-        at = face.rest.numpy()[places]
-        x, y, z = (at - [*np.median(at[:, :2], axis=0), at[:, 2].max()]).T
-        one, none = np.ones_like(x), np.zeros_like(x)
-        pose = np.stack([[one, none, y, x, none, z], [none, one, x, -y, z, none]])
-        basis = face.basis[shapes].numpy()[:, places]
-        moves = np.concatenate([np.stack([basis[..., 0], -basis[..., 1]]), pose], axis=1)
-        slopes = (cv2.Sobel(reference, cv2.CV_32F, *way, scale=1 / 8) for way in ((1, 0), (0, 1)))
-        strong = [softened(slope**2, 2.0) for slope in slopes]
-        across, up = ((one / (one + _PLAIN))[places] for one in strong)
-        varies = [
-            next((off for start, off in _VARIES.items() if called[row].startswith(start)), _USUALLY) for row in shapes
-        ]
-        prior = np.array([*varies, *_POSE]) ** -2.0
-        skin = face.counts.numpy().astype(np.float32)
-        moves = moves.swapaxes(0, 1).reshape(len(prior), -1).astype(np.float32)
-        return _Fit(reference, face.step, shapes, places, skin, (across, up), moves, prior)
-
-    def flow(self, picture: np.ndarray, squarely: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """How far from the reference's places a frame shows them, (2G,) millimetres; and how far that counts, (2G,) in
-        [0,1]."""
-        flow = _flow(self.reference, picture)
-        other = np.abs(_moved(picture, flow).astype(np.float32) - self.reference)
-        counts = cv2.erode(squarely * (self.skin / 255), np.ones((2 * _EDGE + 1,) * 2, np.uint8))
-        counts = (counts / (1 + (softened(other, 2.0) / _OTHER) ** 4))[self.places]
-        across, up = self.contrast
-        return self.step * flow[self.places].T.ravel(), np.concatenate([counts * across, counts * up])
-
-    def solved(self, flow: np.ndarray, counts: np.ndarray, error: float) -> tuple[np.ndarray, np.ndarray, float]:
-        """The shapes' change (M,) and its deviation (M,), of flows (2G,) with an error, and what is left of the flows;
-        millimetres both."""
-        robust, count = np.ones_like(flow), len(self.shapes)
-        for _ in range(_REWEIGHTINGS):
-            weighted = self.moves * (counts * robust * (_THIN / _TOGETHER / error) ** 2).astype(np.float32)
-            H = (weighted @ self.moves.T).astype(np.float64) + np.diag(self.prior)
-            solution = np.linalg.solve(H, weighted @ flow)
-            left = flow - solution.astype(np.float32) @ self.moves
-            robust = 1 / (1 + (left / (2 * error)) ** 2)
-        share = counts * robust
-        remains = float(np.sqrt((share * left**2).sum() / max(float(share.sum()), 1e-9)))
-        return solution[:count], np.sqrt(np.diag(np.linalg.inv(H)))[:count], remains
-
-
 def _reference(pictures: np.ndarray, squarely: np.ndarray) -> np.ndarray:
     """The mean of pictures (S,H,W) that are brought onto it, uint8 (H,W), each as far as it sees a place squarely."""
     share = squarely.astype(np.float32) + 0.25
     mean = np.average(pictures, 0, share).astype(np.uint8)
     for _ in range(_ROUNDS):
-        flows = np.stack([_flow(mean, picture) for picture in pictures])
+        flows = np.stack([optical_flow(mean, picture) for picture in pictures])
         flows -= np.average(flows, 0, np.broadcast_to(share[..., None], flows.shape))
-        brought = [_moved(picture, flow) for picture, flow in zip(pictures, flows, strict=True)]
+        brought = [brought_back(picture, flow) for picture, flow in zip(pictures, flows, strict=True)]
         mean = np.average(np.stack(brought), 0, share).astype(np.uint8)
     return mean
-
-
-def _flow(reference: np.ndarray, picture: np.ndarray) -> np.ndarray:
-    """Where a picture shows each place of the reference, beside that, (H,W,2) pixels."""
-    solver = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-    solver.setFinestScale(0)
-    solver.setPatchStride(4)  # half the time of the preset, and weights as near
-    solver.setVariationalRefinementIterations(2)
-    return solver.calc(reference, picture, np.zeros((*reference.shape, 2), np.float32))
-
-
-def _moved(picture: np.ndarray, flow: np.ndarray) -> np.ndarray:
-    """A picture (H,W) brought back along a flow from the reference."""
-    y, x = np.indices(picture.shape, dtype=np.float32)
-    return cv2.remap(picture, x + flow[..., 0], y + flow[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)

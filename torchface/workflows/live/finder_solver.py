@@ -9,7 +9,7 @@ from torchface.progress import Progress, silent
 from torchface.shape_names import ARKIT
 from torchface.workflows.live.live_frames import LiveFrame, planes
 from torchface.workflows.named_finders import graph_detector, load_finder
-from torchface.workflows.webcam.webcam_graph import webcam_solver
+from torchface.workflows.webcam.webcam_graph import skin_follower, webcam_solver
 
 _USUAL = 1 / 30  # seconds
 
@@ -26,16 +26,18 @@ class FinderSolver:
         self._tracker = LandmarkTracker(named.finder, detector=graph_detector())
         self._solver = webcam_solver(named.expects)
         self._state = self._solver.start()
+        self._skin = skin_follower()
 
     def step(self, picture: np.ndarray, interval: float | None, controls: WebcamControls) -> LiveFrame:
         """Solves the next frame; see :class:`torchface.workflows.live.live_frames.FaceSolver`."""
         height, width = picture.shape[:2]
         reading = self._tracker.step(planes(picture))
-        self._state = state = self._solver.step(self._state, reading, interval or _USUAL, controls, (width, height))
+        interval = interval or _USUAL
+        self._state = state = self._solver.step(self._state, reading, interval, controls, (width, height))
         ever = bool(state.rotation.any())
         rotation = state.rotation if ever else torch.full((3, 3), torch.nan)
         return LiveFrame(
-            state.weights,
+            self._skin.followed(picture, state, interval, controls),
             rotation,
             reading.landmarks,
             reading.iris,

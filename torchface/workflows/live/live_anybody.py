@@ -15,13 +15,16 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from torchface.capture.anybody import WebcamControls
+from torchface.capture.anybody import WebcamControls, WebcamSettings
+from torchface.capture.anybody.skin_follower import SkinFollower
+from torchface.capture.anybody.webcam_state import StateLayout
 from torchface.errors import TorchfaceError, ValueRangeError
 from torchface.files.job_lock import job_lock
 from torchface.io import load_take
 from torchface.io.protocols.stream_address import is_source, parse_source
 from torchface.io.protocols.weight_sender import find_receiver
 from torchface.io.take_files import RECORDING_ENDINGS
+from torchface.landmarks.images.frame_reader.face_reader import STATE
 from torchface.number_checks import checked_number
 from torchface.onnx.webcam.webcam_session import ModuleSession, WebcamSession
 from torchface.progress import Progress, silent
@@ -48,7 +51,7 @@ from torchface.workflows.live.received_source import ReceivedSolver, ReceivedSou
 from torchface.workflows.live.recordings import Recordings, SavedTake
 from torchface.workflows.live.session_prompts import LightWatch, Watch
 from torchface.workflows.live.weight_streams import WeightStreams
-from torchface.workflows.webcam.webcam_graph import kept_webcam_graph, webcam_module
+from torchface.workflows.webcam.webcam_graph import kept_webcam_graph, skin_follower, webcam_module
 
 _USUAL = 1 / 30  # seconds
 # Beside a session, which goes first.
@@ -66,11 +69,14 @@ _MADE = "the graph is made: it read the last faces, and reads all from the next 
 
 
 class PersonSolver:
-    """Solves frames for ARKit's weights; ``better`` gives once a session to go on with, else None. ``reader`` says what
-    has become of it."""
+    """Solves frames for ARKit's weights, which then follow the skin; ``better`` gives once a session to go on with,
+    else None. ``reader`` says what has become of it."""
 
-    def __init__(self, session: WebcamSession, better: Callable[[], WebcamSession | None] | None = None) -> None:
-        self._session, self._better = session, better
+    def __init__(
+        self, session: WebcamSession, skin: SkinFollower, better: Callable[[], WebcamSession | None] | None = None
+    ) -> None:
+        self._session, self._skin, self._better = session, skin, better
+        self._layout = StateLayout(len(skin.names), WebcamSettings().coefficients)
         self._ever, self.reader = False, "" if better is None else _UNMADE
 
     @property
@@ -84,9 +90,11 @@ class PersonSolver:
             better.resume(self._session.state)
             self._session, self.reader = better, _MADE
         self._session.controls = controls
-        answer = self._session.step(picture, _USUAL if interval is None else interval)
+        interval = _USUAL if interval is None else interval
+        answer = self._session.step(picture, interval)
+        state = self._layout.unpack(self._session.state[STATE:])
         solved = LiveFrame(
-            answer.weights,
+            self._skin.followed(picture, state, interval, controls),
             answer.rotation,
             answer.landmarks,
             answer.iris,
@@ -104,10 +112,11 @@ def person_solver(progress: Progress) -> PersonSolver:
 
     Its graph takes a minute to be made, once. Until then PyTorch solves, with the same weights at a lower rate.
     """
+    skin = skin_follower()
     if (graph := kept_webcam_graph()) is not None:
-        return PersonSolver(WebcamSession(graph))
+        return PersonSolver(WebcamSession(graph), skin)
     progress("reading faces by PyTorch until the quicker graph is there, once")
-    return PersonSolver(ModuleSession(webcam_module()), _SessionBeingMade().take)
+    return PersonSolver(ModuleSession(webcam_module()), skin, _SessionBeingMade().take)
 
 
 class _SessionBeingMade:

@@ -2,12 +2,10 @@
 
 from dataclasses import replace
 
-import torch
 from torch import Tensor
 
-from torchface.capture.antagonist_shapes import signed_difference, signed_quantities
 from torchface.capture.own_rig import VideoSolution
-from torchface.capture.own_rig.skin_motion import skin_motion
+from torchface.capture.own_rig.skin_motion import skin_motion, unless_shut
 from torchface.io.video.blank_video import BlankVideo
 from torchface.progress import Progress
 from torchface.temporal import savitzky_golay
@@ -40,7 +38,5 @@ def followed_weights(
         return solution.weights
     window = calm_window(clip.fps, count)
     calm = motion if window is None else replace(motion, change=savitzky_golay(motion.change, window))
-    weights, signed = calm.applied(solution.weights, resting), signed_quantities(rig.names).to(solution.weights)
-    # Skin does not show blinks: where one is solved, its lid does not rise.
-    shut = ((solution.weights * ~motion.deviation.isfinite()) > 0).to(signed) @ signed.abs().T @ signed.abs() > 0
-    return torch.where(shut, solution.weights, signed_difference(weights, signed))
+    weights = calm.applied(solution.weights, resting)
+    return unless_shut(solution.weights, weights, rig.names, ~motion.deviation.isfinite())

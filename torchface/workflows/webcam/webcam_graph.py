@@ -11,6 +11,7 @@ import onnxruntime
 
 from torchface import zoo
 from torchface.capture.anybody import WebcamSettings, WebcamSolver
+from torchface.capture.anybody.skin_follower import SkinFollower
 from torchface.errors import NameMismatchError
 from torchface.landmarks import BoxNetwork, LandmarkNetwork
 from torchface.landmarks.images.frame_reader.face_reader import FaceReader, WebcamNetworks
@@ -28,6 +29,7 @@ from torchface.onnx.webcam.webcam_model import (
 from torchface.progress import Progress, silent
 from torchface.synthetic.head.performer import performer
 from torchface.workflows.cached_graph import cached_file, cached_graph, kept_file
+from torchface.workflows.named_finders import part_finder
 from torchface.workflows.named_priors import DEFAULT_PRIOR, load_priors
 
 __all__ = ["default_webcam_solver"]
@@ -143,3 +145,8 @@ def webcam_solver(expects: bool, settings: WebcamSettings | None = None) -> Webc
     if expects:
         prior, settings = None, replace(settings, sparsity=0.0)
     return WebcamSolver(rig, heads.shape.modes[:, heads.landmarks], prior, settings)
+
+
+def skin_follower() -> SkinFollower:
+    """What follows the skin in frames that the solver solved."""
+    return SkinFollower(performer(texture=False), part_finder())
