@@ -39,6 +39,6 @@ class SamplesInMemory:
 def blocks(samples: Samples, largest: int = _BLOCK_BYTES) -> Iterator[tuple[int, int]]:
     """Begin and end of blocks that take at most ``largest`` bytes each in float64."""
     count, vertices, channels = samples.shape
-    rows = max(1, largest // (8 * vertices * channels))
+    rows = max(1, largest // max(1, 8 * vertices * channels))
     for begin in range(0, count, rows):
         yield begin, min(begin + rows, count)

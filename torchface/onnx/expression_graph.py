@@ -68,11 +68,14 @@ class OffsetRegression(nn.Module):
         # A vertex that is not predicted takes the row of zeros that is put at the end.
         rows = torch.full((shapes * vertices,), places)
         rows[model.places] = torch.arange(places)
-        self.sizes = (-1, shapes, vertices, 3)
+        self.shape = (-1, shapes, vertices, 3)
+        self.sizes = [[3 * size for size in sizes] for sizes in model.sizes]
+        bases = model.neutral_components.split(model.sizes[0], 1)
+        inputs = zip(bases, model.coefficients.view(len(bases), *model.coefficients.shape[-2:]), strict=True)
         for name, value in {
             "target": target,
             "target_region": target[model.region],
-            "inputs": model.neutral_components.flatten(1).T @ model.coefficients,
+            "inputs": torch.cat([basis.flatten(1).T @ B for basis, B in inputs]),
             "offset_mean": model.offset_mean.flatten(),
             "offset_components": model.offset_components.flatten(1),
             "region": model.region,
@@ -88,7 +91,9 @@ class OffsetRegression(nn.Module):
         for _ in range(_ROTATION_STEPS):
             rotation = 1.5 * rotation - 0.5 * (rotation @ rotation.mT @ rotation)
         aligned = centred.index_select(1, self.region) @ rotation.mT
-        coefficients = (aligned - self.target_region).flatten(1) @ self.inputs
-        predicted = torch.addmm(self.offset_mean, coefficients, self.offset_components).unflatten(1, (-1, 3))
-        offsets = nn.functional.pad(predicted, (0, 0, 0, 1)).index_select(1, self.rows)
-        return (offsets @ rotation).reshape(self.sizes)
+        beyond = (aligned - self.target_region).flatten(1).split(self.sizes[0], 1)
+        inputs, outputs = self.inputs.split(self.sizes[0]), self.offset_components.split(self.sizes[1], 1)
+        predicted = [part @ inner @ outer for part, inner, outer in zip(beyond, inputs, outputs, strict=True)]
+        moving = (torch.cat(predicted, 1) + self.offset_mean).unflatten(1, (-1, 3))
+        offsets = nn.functional.pad(moving, (0, 0, 0, 1)).index_select(1, self.rows)
+        return (offsets @ rotation).reshape(self.shape)

@@ -20,6 +20,7 @@ from torchface.modeling import (
     transfer_deformation,
 )
 from torchface.modeling.rigging.expression_training import choose_components
+from torchface.onnx.expression_graph import OffsetRegression
 from torchface.synthetic import draw_identities, performer
 
 V = 40
@@ -66,6 +67,21 @@ def test_a_planted_law_comes_back_on_new_people(people: tuple[Tensor, Tensor]) -
     assert left < 0.05 * (neutrals[20:, None] + of_mean - expressions[20:]).norm(dim=-1).mean()
 
 
+def test_what_is_small_is_predicted_from_its_own_form_beside_what_is_large() -> None:
+    """Jaws differ by far more, and in more ways, than there are components; blinks follow from the lids alone."""
+    mean, jaw, lids = 50 * noise(120, 3), slice(0, 100), slice(100, 110)
+    forms, lid_forms = noise(60, 20, seed=1), noise(60, 2, seed=2)
+    neutrals = mean.expand(60, -1, -1).clone()
+    neutrals[:, jaw] += 3 * torch.einsum("mk,kvc->mvc", forms, noise(20, 100, 3, seed=3))
+    neutrals[:, lids] += 0.3 * torch.einsum("mk,kvc->mvc", lid_forms, noise(2, 10, 3, seed=4))
+    offsets = torch.zeros(60, 2, 120, 3)
+    offsets[:, 0, jaw] = 10 + torch.einsum("mk,kvc->mvc", forms, noise(20, 100, 3, seed=5))
+    offsets[:, 1, lids] = 5 + torch.einsum("mk,kvc->mvc", lid_forms, noise(2, 10, 3, seed=6))
+    model = ExpressionRegression.fit(neutrals[:50], neutrals[:50, None] + offsets[:50], names=["jaw", "blink"])
+    wrong = (model.offsets(neutrals[50:]) - offsets[50:])[:, 1].square().sum()
+    assert wrong < 0.02 * (offsets[:50].mean(0) - offsets[50:])[:, 1].square().sum()
+
+
 def test_what_never_moves_stays_exactly(people: tuple[Tensor, Tensor]) -> None:
     neutrals, expressions = people
     model = ExpressionRegression.fit(neutrals, expressions)
@@ -91,14 +107,16 @@ def test_agrees_with_scikit_learn(people: tuple[Tensor, Tensor], ridge: float) -
         laid[i] = neutrals[i] @ pose.T
         expressions[i] = expressions[i] @ pose.T
     X = laid.flatten(1) - laid.reshape(len(laid), V, 3).mean(1).repeat(1, V)
-    offsets = (expressions - laid[:, None]).flatten(1)
-    inner, outer = PCA(6).fit(X[:20]), PCA(5).fit(offsets[:20])
+    inner = PCA(6).fit(X[:20])
     scores = inner.transform(X[:20])
     strength = ridge * (scores**2).sum() / 6
-    line = (Ridge(strength, fit_intercept=False) if ridge else LinearRegression(fit_intercept=False)).fit(
-        scores, outer.transform(offsets[:20])
-    )
-    expected = torch.from_numpy(outer.inverse_transform(line.predict(inner.transform(X[20:]))))
+    expected = []
+    for offsets in (expressions - laid[:, None]).flatten(2).unbind(1):
+        outer = PCA(5).fit(offsets[:20])
+        line = Ridge(strength, fit_intercept=False) if ridge else LinearRegression(fit_intercept=False)
+        line.fit(scores, outer.transform(offsets[:20]))
+        expected.append(torch.from_numpy(outer.inverse_transform(line.predict(inner.transform(X[20:])))))
+    expected = torch.cat(expected, 1)
     found = torch.stack([model.offsets(laid[i : i + 1])[0] for i in range(20, 24)]).flatten(1)
     torch.testing.assert_close(found, expected, rtol=1e-3, atol=1e-3 * float(expected.abs().max()))
 
@@ -241,6 +259,46 @@ def test_awkward_people(people: tuple[Tensor, Tensor]) -> None:
     assert torch.equal(still(neutrals), neutrals[:, None])
 
 
+def test_where_neutrals_do_not_differ_everybody_gets_the_mean() -> None:
+    """Heads differ in how far apart two vertices are, which turns none; the second expression moves others."""
+    base, apart = 50 * noise(V, 3), noise(12, seed=1)
+    base[:2] = torch.tensor([[50.0, 0, 0], [-50, 0, 0]])
+    heads = base.expand(12, -1, -1).clone()
+    heads[:, :2, 0] += torch.stack([apart, -apart], 1)
+    offsets = torch.zeros(12, 2, V, 3)
+    offsets[:, 0, :2, 1], offsets[:, 1, V // 2 :] = 9 + 2 * apart[:, None], 4 + noise(12, V // 2, 3)
+    model = ExpressionRegression.fit(heads, heads[:, None] + offsets)
+    found = model.offsets(heads)
+    torch.testing.assert_close(found[:, 0], offsets[:, 0], rtol=0, atol=1e-3)
+    torch.testing.assert_close(found[:, 1], offsets[:, 1].mean(0).expand(12, -1, -1), rtol=0, atol=1e-3)
+    assert model.distance(heads).square().mean() < 1
+
+
+def test_models_of_older_versions_load(people: tuple[Tensor, Tensor]) -> None:
+    """They had one set of components for all expressions: of expressions that move the same vertices it is as good."""
+    neutrals, expressions = people
+    new = ExpressionRegression.fit(neutrals, expressions, ExpressionSettings(4, 8), region=torch.ones(V) > 0)
+    region, moving = (sum(sizes) for sizes in new.sizes)
+    state = new.state_dict()
+    state["region"], state["neutral_components"] = state["region"][:V], state["neutral_components"][:, :V]
+    places = moving // 2
+    J = len(new.offset_components)
+    outer = torch.zeros(2 * J, moving, 3)
+    outer[:J, :places], outer[J:, places:] = new.offset_components[:, :places], new.offset_components[:, places:]
+    state["offset_components"], state["coefficients"] = outer, torch.cat(list(new.coefficients), 1)
+    state["deviations"] = state["deviations"][0]
+    old = ExpressionRegression.from_config(
+        new.config | {"region": region // 2, "moving": moving, "offset_components": 2 * J}
+    )
+    old.load_state_dict(state)
+    torch.testing.assert_close(old(neutrals), new(neutrals), rtol=0, atol=1e-3)
+    torch.testing.assert_close(old.distance(neutrals), new.distance(neutrals))
+    assert (old.config["region"], old.config["moving"]) == (V, moving)
+    torch.testing.assert_close(
+        OffsetRegression(old)(neutrals.float()), new.offsets(neutrals).float(), rtol=0, atol=1e-2
+    )
+
+
 def test_bad_input_is_named(people: tuple[Tensor, Tensor]) -> None:
     neutrals, expressions = people
     fit = ExpressionRegression.fit
@@ -266,6 +324,9 @@ def test_bad_input_is_named(people: tuple[Tensor, Tensor]) -> None:
         fit(neutrals, expressions)(neutrals[:, 1:])
     with pytest.raises(ShapeError, match=r"expected \(B,40,3\)"):
         fit(neutrals, expressions).distance(neutrals[:, 1:])
+    for what, wrong in (("region", [39]), ("moving", 78), ("region", [40, -1])):
+        with pytest.raises(ShapeError, match=rf"{what}: found .*, expected a number for each of 2"):
+            ExpressionRegression.from_config(fit(neutrals, expressions).config | {what: wrong})
     with pytest.raises(ShapeError, match=r"found \(24, 0, 40, 3\)"):
         fit(neutrals, expressions[:, :0])
 
@@ -294,7 +355,17 @@ def test_shapes_that_the_model_predicts_worse_are_transferred() -> None:
     """Of a person whom the zoo's model has not seen: the choice is better than either way alone."""
     model = zoo.get_model("expressions", ExpressionRegression)
     person = performer(draw_identities(3, torch.Generator().manual_seed(77))[1], texture=False).select(model.names)
-    made = neutral_rig(model, performer(texture=False).select(model.names), person.neutral)
+    template = performer(texture=False).select(model.names)
+    made = neutral_rig(model, template, person.neutral)
+    squared = (made.rig.deltas - person.deltas).square().sum((1, 2))
+    assert bool(made.learned.all())
+    assert bool((squared < 0.2 * (made.transferred.deltas - person.deltas).square().sum((1, 2))).all())
+    found = (squared / len(person.vertices)).sqrt()
+    assert (found / made.expected[0]).log().abs().max() < math.log(4)
+    # A model that has learned the contrary of blinks, and knows it.
+    model.coefficients[-2:] *= -1
+    model.errors[0, -2:] = 100.0
+    made = neutral_rig(model, template, person.neutral)
     errors = {
         "rig": made.rig.deltas,
         "transfer": made.transferred.deltas,
@@ -306,8 +377,6 @@ def test_shapes_that_the_model_predicts_worse_are_transferred() -> None:
         "eyeBlinkRight",
     ]
     assert squared["rig"].sum() < min(squared["regression"].sum(), squared["transfer"].sum())
-    found = (squared["regression"] / len(person.vertices)).sqrt()
-    assert (found / made.expected[0]).log().abs().max() < math.log(4)
 
 
 def test_distance_is_that_of_the_people_learned_from(people: tuple[Tensor, Tensor]) -> None:

@@ -1,6 +1,7 @@
 """Expressions from a neutral face alone, as learned from other people's faces and expressions."""
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
@@ -22,11 +23,11 @@ NEUTRAL_COMPONENTS, OFFSET_COMPONENTS = 14, 13
 
 @dataclass(frozen=True)
 class ExpressionSettings:
-    """How many components an expression regression has, how strongly they are held down, and what it predicts.
+    """How many components each expression has, how strongly they are held down, and what is predicted.
 
     Args:
         neutral_components, offset_components: how many, as many as the data hold where these are fewer; None
-            has them chosen by leaving out one person after the other.
+            has them chosen for each expression by leaving out one person after the other.
         ridge: as a share of the neutrals' mean variance a component; None has it chosen alike.
         form: "offsets" (equation 32) or "expressions" (equation 31).
 
@@ -58,20 +59,25 @@ class ExpressionRegression(nn.Module):
 
     .. math:: X = (N - \bar N) \, N_{PCA}, \quad Y = X B, \quad \Delta = \bar\Delta + Y \, \Delta_{PCA}^\top
 
-    with B of least squares. What is predicted are offsets :math:`\Delta = S - N` (the form "offsets"); in the form
-    "expressions" it is S itself, as the thesis tries first: there the identity that 13 components cannot hold leaks
-    away, and it is here for comparison.
+    with B of least squares, for each expression by itself. What is predicted are offsets :math:`\Delta = S - N` (the
+    form "offsets"); in the form "expressions" it is S itself, as the thesis tries first: there the identity that 13
+    components cannot hold leaks away, and it is here for comparison.
 
     A neutral face may have any pose: it is aligned with the mean neutral first, rotation and translation only, and
-    what is predicted is rotated back. N is the part of the neutral that moves in some expression. Vertices that no
-    example moves are not stored and stay exactly where they are.
+    what is predicted is rotated back. Vertices that no example moves are not stored and stay exactly where they are.
+
+    The thesis maps one expression, the smile, from components of the whole face. Here N is the part of the face that
+    moves in the expression: components of the whole face, or of what moves in any expression, hold mostly the jaw and
+    the cheeks and too little of the lids.
 
     Args:
         vertices: V.
         names: of the N expressions.
-        region: how many of the vertices the prediction depends on.
-        moving: how many of the N·V places are predicted.
-        neutral_components, offset_components: of the two bases.
+        region: on how many of the vertices each expression depends; one number of models of older versions, which have
+            one set of components for all expressions.
+        moving: how many of the vertices each expression moves; or how many of the N·V places, alike.
+        neutral_components, offset_components: of the two bases, the most that an expression has; rows are 0 where it
+            has fewer.
         topology: ``Mesh.fingerprint()`` of the faces learned from, checked where given.
         form: "offsets" or "expressions".
 
@@ -101,8 +107,8 @@ class ExpressionRegression(nn.Module):
         self,
         vertices: int,
         names: Sequence[str],
-        region: int,
-        moving: int,
+        region: Sequence[int] | int,
+        moving: Sequence[int] | int,
         neutral_components: int,
         offset_components: int,
         topology: str | None = None,
@@ -115,25 +121,31 @@ class ExpressionRegression(nn.Module):
         if not words or len(set(names)) < len(names) or not names:
             raise NameMismatchError(f"names: found {names!r:.80}, expected distinct names, one at least")
         self.names: tuple[str, ...] = tuple(names)
+        self.sizes = tuple((sizes,) if isinstance(sizes, int) else tuple(sizes) for sizes in (region, moving))
+        stacked = () if isinstance(region, int) else (len(names),)
+        for what, sizes in zip(("region", "moving"), self.sizes, strict=True):
+            if len(sizes) != math.prod(stacked) or min(sizes) < 0:
+                raise ShapeError(f"{what}: found {sizes!r:.80}, expected a number for each of {len(names)} expressions")
         self.topology, self.form = topology, form
         self.register_buffer("neutral_mean", torch.zeros(vertices, 3))
-        self.register_buffer("region", torch.zeros(region, dtype=torch.int64))
-        self.register_buffer("neutral_components", torch.zeros(neutral_components, region, 3))
-        self.register_buffer("offset_mean", torch.zeros(moving, 3))
-        self.register_buffer("offset_components", torch.zeros(offset_components, moving, 3))
-        self.register_buffer("coefficients", torch.zeros(neutral_components, offset_components))
-        self.register_buffer("places", torch.zeros(moving, dtype=torch.int64))
+        self.register_buffer("region", torch.zeros(sum(self.sizes[0]), dtype=torch.int64))
+        self.register_buffer("neutral_components", torch.zeros(neutral_components, sum(self.sizes[0]), 3))
+        self.register_buffer("offset_mean", torch.zeros(sum(self.sizes[1]), 3))
+        self.register_buffer("offset_components", torch.zeros(offset_components, sum(self.sizes[1]), 3))
+        self.register_buffer("coefficients", torch.zeros(*stacked, neutral_components, offset_components))
+        self.register_buffer("places", torch.zeros(sum(self.sizes[1]), dtype=torch.int64))
         self.register_buffer("deviations", None)
         self.register_buffer("errors", None)
 
     def add_errors(self) -> None:
         """Gives it the buffers of what it knows of itself, which models saved before there were any lack.
 
-        ``deviations`` (K+1,): of people along each component and, last, of what no component holds, millimetres.
+        ``deviations`` (N,K+1): of people along each expression's components and, last, of what none of them holds,
+        millimetres; 0 where there is no such component.
         ``errors`` (2,N): of regression, over 1 + d², and of transfer for people left out, mm², summed over the
         vertices; 0 where nobody has compared.
         """
-        self.deviations = self.neutral_mean.new_ones(len(self.neutral_components) + 1)
+        self.deviations = self.neutral_mean.new_zeros(*self.coefficients.shape[:-2], len(self.neutral_components) + 1)
         self.errors = self.neutral_mean.new_zeros(2, len(self.names))
 
     @classmethod
@@ -150,9 +162,9 @@ class ExpressionRegression(nn.Module):
         """Learns from people in correspondence, each with a neutral face and the same expressions.
 
         People may be read in blocks. Passes over them: four align the neutrals with each other, one finds what moves,
-        two sets of principal components take what ``MorphableModel.fit`` takes, and one sums up the normal equations.
-        Memory does not grow with their number but by a pose each. Numbers of components and a ridge that are to be
-        chosen are chosen from 300 people, evenly spread, where there are more.
+        and one reads that into memory. Where it takes more than 256 MiB there are several passes an expression instead,
+        and memory does not grow with the number of people but by a pose each. Numbers of components and a ridge that
+        are to be chosen are chosen from 300 people, evenly spread, where there are more.
 
         Args:
             neutrals: (M,V,3), millimetres, in any pose.
@@ -162,7 +174,7 @@ class ExpressionRegression(nn.Module):
             names: of the expressions; ``expression0``, ... if absent.
             topology: ``Mesh.fingerprint()`` of the faces.
             region: mask (V,) of the vertices to learn from; those that move by a twentieth as far as the one that moves
-                most in some expression, if absent; all of them for the form "expressions", as in the thesis.
+                most in the expression, if absent; all of them for the form "expressions", as in the thesis.
             progress: called with each step and how far it is.
 
         Raises:
@@ -185,11 +197,12 @@ class ExpressionRegression(nn.Module):
     @property
     def config(self) -> dict[str, Any]:
         """What the constructor needs: plain values only."""
+        region, moving = (list(sizes) if self.coefficients.ndim == 3 else sizes[0] for sizes in self.sizes)
         return {
             "vertices": len(self.neutral_mean),
             "names": list(self.names),
-            "region": len(self.region),
-            "moving": len(self.places),
+            "region": region,
+            "moving": moving,
             "neutral_components": len(self.neutral_components),
             "offset_components": len(self.offset_components),
             "topology": self.topology,
@@ -219,9 +232,13 @@ class ExpressionRegression(nn.Module):
         neutrals = as_real(neutrals, "neutrals")
         pose = self._pose(neutrals)
         aligned = pose.apply(neutrals)
-        X = self._beyond(aligned) @ self.neutral_components.flatten(1).T.to(aligned)
-        Y = X @ self.coefficients.to(X)
-        moving = self.offset_mean.to(Y) + torch.einsum("bk,kpc->bpc", Y, self.offset_components.to(Y))
+        bases = self.offset_components.to(aligned).split(self.sizes[1], 1)
+        maps = self.coefficients.to(aligned).view(len(bases), *self.coefficients.shape[-2:])
+        offsets = [
+            torch.einsum("bk,kpc->bpc", part @ inner.T @ B, outer)
+            for (part, inner), B, outer in zip(self._beyond(aligned), maps, bases, strict=True)
+        ]
+        moving = torch.cat(offsets, 1) + self.offset_mean.to(aligned)
         whole = moving.new_zeros(len(neutrals), len(self.names) * len(self.neutral_mean), 3)
         whole = whole.index_copy(1, self.places, moving).unflatten(1, (len(self.names), -1))
         if self.form == "expressions":
@@ -235,24 +252,31 @@ class ExpressionRegression(nn.Module):
         .. math:: d^2 = \frac1K \sum_k \frac{X_k^2}{\sigma_k^2}
             + \frac{\lVert (N - \bar N) - X N_{PCA}^\top \rVert^2}{\sigma_{rest}^2}
 
-        Among those learned from the first part is 1 on average, and so is the second.
+        averaged over the expressions. Among those learned from the first part is 1 on average, and so is the second.
         """
         neutrals = as_real(neutrals, "neutrals")
         if self.deviations is None:
             return neutrals.new_full((len(neutrals),), torch.nan)
-        beyond = self._beyond(self._pose(neutrals).apply(neutrals))
-        basis, deviations = self.neutral_components.flatten(1).to(beyond), self.deviations.to(beyond)
-        X = beyond @ basis.T
-        left = (beyond - X @ basis).square().sum(1)
-        return ((X / deviations[:-1]).square().mean(1) + left / deviations[-1] ** 2).sqrt()
+        deviations, squared = torch.atleast_2d(self.deviations).to(neutrals), neutrals.new_zeros(len(neutrals))
+        parts = self._beyond(self._pose(neutrals).apply(neutrals))
+        for (part, basis), along in zip(parts, deviations, strict=True):
+            X = part @ basis.T
+            apart = torch.cat([X.square(), (part - X @ basis).square().sum(1, keepdim=True)], 1)
+            apart = torch.where(along > 0, apart / along.square(), 0.0)
+            squared = squared + apart[:, :-1].sum(1) / (along[:-1] > 0).sum().clamp(min=1) + apart[:, -1]
+        return (squared / len(deviations)).sqrt()
 
     def _pose(self, neutrals: Tensor) -> Similarity:
         if neutrals.ndim != 3 or neutrals.shape[1:] != self.neutral_mean.shape:
             raise ShapeError(f"neutrals: found {tuple(neutrals.shape)}, expected (B,{len(self.neutral_mean)},3)")
         return similarity_transform(neutrals, self.neutral_mean.to(neutrals).expand_as(neutrals), scale=False)
 
-    def _beyond(self, aligned: Tensor) -> Tensor:
-        return (aligned - self.neutral_mean.to(aligned))[:, self.region].flatten(1)
+    def _beyond(self, aligned: Tensor) -> Iterator[tuple[Tensor, Tensor]]:
+        """For each expression how its region differs from the mean's, (B,3R), and the components of that, (K,3R)."""
+        beyond = (aligned - self.neutral_mean.to(aligned))[:, self.region]
+        both = (values.split(self.sizes[0], 1) for values in (beyond, self.neutral_components.to(beyond)))
+        for part, components in zip(*both, strict=True):
+            yield part.flatten(1), components.flatten(1)
 
     def check_state(self) -> None:
         """Raises ``TopologyError`` where a loaded state points to vertices that there are not."""

@@ -10,7 +10,7 @@ from torchface.errors import NameMismatchError, ShapeError, ValueRangeError
 from torchface.geometry.sample_batches import Samples, SamplesInMemory, blocks
 from torchface.modeling.morphable.principal_components import PrincipalComponents, principal_components
 from torchface.modeling.rigging.expression_regression import STILL, ExpressionRegression, ExpressionSettings, Form
-from torchface.modeling.rigging.people_together import MovingPlaces, NeutralRegion, Predicted, align_neutrals
+from torchface.modeling.rigging.people_together import Aligned, Predicted, Rows, align_neutrals
 from torchface.number_checks import as_tensor, checked_type
 from torchface.optim.eigenpairs import largest_eigenpairs
 from torchface.progress import Progress, silent
@@ -19,6 +19,7 @@ _CHOSEN_FROM = 300
 """People from whom components and ridge are chosen at most; their Gram matrices are decomposed once a person."""
 # Of the vertex that moves most. The form of ears and neck predicts little of a smile, and would fill the components.
 _MOVES = 0.05
+_HELD_BYTES = 2**28  # parts of people that together take no more are read once, not in each pass
 _LEAST_LEFT = 0.01  # of the variance, beyond the components: few people fit in them whole, another one does not
 
 
@@ -35,96 +36,115 @@ def fit_expressions(
     checked_type("settings", settings, ExpressionSettings)
     neutrals, expressions, names = _people(neutrals, expressions, names)
     progress = progress or silent
-    form, ridge = settings.form, settings.ridge
-    neutral_components, offset_components = settings.neutral_components, settings.offset_components
     progress("aligning the neutrals")
     mean, poses = align_neutrals(neutrals)
-    predicted = Predicted(neutrals, expressions, poses, form)
+    predicted = Predicted(neutrals, expressions, poses, settings.form)
     progress("finding what moves")
-    motion = _motion(predicted, len(names))
-    considered = _considered(motion, region, form)
-    flat, moving = NeutralRegion(neutrals, poses, considered), MovingPlaces(predicted, motion.places)
-    if neutral_components is None or offset_components is None or ridge is None:
-        progress("choosing how many components")
-        inputs, outputs = (_some(samples).flatten(1) for samples in (flat, moving))
-        choice = choose_components(inputs, outputs, neutral_components, offset_components, ridge)
-        neutral_components, offset_components, ridge = choice.inputs, choice.outputs, choice.ridge
-    neutral = principal_components(flat, neutral_components, progress=progress)
-    offset = _components_or_mean(moving, motion, offset_components, progress)
-    counts = len(neutral.components), len(offset.components)
-    model = ExpressionRegression(len(mean), names, len(considered), len(motion.places), *counts, topology, form)
+    squared, places = _motion(predicted, len(names))
+    considered = _considered(squared, region, settings.form)
+    ids = considered.nonzero()[:, 1]
+    sizes = considered.sum(1).tolist(), torch.bincount(places // len(mean), minlength=len(names)).tolist()
+    inputs, outputs = _parts(Aligned(neutrals, poses), ids, sizes[0]), _parts(predicted, places, sizes[1])
+    learned = []
+    for number, parts in enumerate(zip(inputs, outputs, strict=True)):
+        learned.append(_learned(*parts, settings))
+        progress("learning expressions", number + 1, len(names))
+    counts = max(len(one.neutral.components) for one in learned), max(len(one.offset.components) for one in learned)
+    if counts[0] == 0:
+        raise ValueRangeError(
+            f"neutrals: found {neutrals.shape[0]} that are all the same where they move, expected some that differ"
+        )
+    model = ExpressionRegression(len(mean), names, *sizes, *counts, topology, settings.form)
     model.add_errors()
-    model.neutral_mean.copy_(mean)
-    model.region.copy_(considered)
-    model.neutral_components.copy_(neutral.components.unflatten(1, (-1, 3)))
-    model.offset_mean.copy_(offset.mean.view(-1, 3))
-    model.offset_components.copy_(offset.components.reshape(counts[1], len(motion.places), 3))
-    progress("solving for the coefficients")
-    gram, product = torch.zeros(counts[0], counts[0]).double(), torch.zeros(counts).double()
-    for begin, end in blocks(expressions):
-        X = flat.read(begin, end).flatten(1) - neutral.mean
-        Y = moving.read(begin, end).flatten(1) - offset.mean
-        X = X @ model.neutral_components.flatten(1).double().T
-        gram += X.T @ X
-        product += X.T @ (Y @ model.offset_components.flatten(1).double().T)
-    gram.diagonal().add_(ridge * gram.diagonal().mean())
-    model.coefficients.copy_(torch.linalg.solve(gram, product))
-    model.places.copy_(motion.places)
-    kept = neutral.standard_deviations.square()
-    left = max(neutral.total_variance - float(kept.sum()), _LEAST_LEFT * neutral.total_variance)
     assert model.deviations is not None
-    model.deviations.copy_(torch.cat([kept, kept.new_tensor([left])]).sqrt())
+    for name, value in (("neutral_mean", mean), ("region", ids), ("places", places)):
+        getattr(model, name).copy_(value)
+    model.offset_mean.copy_(torch.cat([one.offset.mean for one in learned]).view(-1, 3))
+    inner, outer = model.neutral_components.split(sizes[0], 1), model.offset_components.split(sizes[1], 1)
+    for number, one in enumerate(learned):
+        K, J = one.coefficients.shape
+        inner[number][:K] = one.neutral.components.view(K, sizes[0][number], 3)
+        outer[number][:J] = one.offset.components.view(J, sizes[1][number], 3)
+        model.coefficients[number, :K, :J] = one.coefficients
+        kept, total = one.neutral.standard_deviations, one.neutral.total_variance
+        model.deviations[number, :K] = kept
+        model.deviations[number, -1] = max(total - float(kept.square().sum()), _LEAST_LEFT * total) ** 0.5
     return model
 
 
 @dataclass(frozen=True, eq=False)
-class _Motion:
-    """How far people move."""
+class _Learned:
+    """What is learned of one expression."""
 
-    squared: Tensor  # mean of the squared offset of each vertex in each expression, (N,V)
-    places: Tensor  # rows of the N·V that anyone moves, (P,)
-    differs: bool  # whether people move these differently
+    neutral: PrincipalComponents  # of its region
+    offset: PrincipalComponents  # of the vertices that it moves
+    coefficients: Tensor  # (K,J)
 
 
-def _motion(predicted: Predicted, expressions: int) -> _Motion:
+def _learned(inputs: Samples, outputs: Samples, settings: ExpressionSettings) -> _Learned:
+    """Of its part of the neutrals (M,R,3) and what is to be predicted (M,P,3)."""
+    inner, outer, ridge = settings.neutral_components, settings.offset_components, settings.ridge
+    if outputs.shape[1] and (inner is None or outer is None or ridge is None):
+        choice = choose_components(_some(inputs).flatten(1), _some(outputs).flatten(1), inner, outer, ridge)
+        inner, outer, ridge = choice.inputs, choice.outputs, choice.ridge
+    neutral, offset = _components_or_mean(inputs, inner), _components_or_mean(outputs, outer)
+    counts = len(neutral.components), len(offset.components)
+    gram, product = torch.zeros(counts[0], counts[0]).double(), torch.zeros(counts).double()
+    for begin, end in blocks(max(inputs, outputs, key=lambda samples: samples.shape[1])):
+        X = (inputs.read(begin, end).flatten(1) - neutral.mean) @ neutral.components.double().T
+        gram += X.T @ X
+        product += X.T @ ((outputs.read(begin, end).flatten(1) - offset.mean) @ offset.components.double().T)
+    gram.diagonal().add_((ridge or 0.0) * gram.diagonal().mean())
+    return _Learned(neutral, offset, torch.linalg.solve(gram, product))
+
+
+def _parts(samples: Samples, rows: Tensor, sizes: list[int]) -> list[Rows]:
+    """The rows (ΣR,) of samples (M,V,3) as those of each expression, (M,R,3); read once if they are few."""
+    if 12 * samples.shape[0] * len(rows) <= _HELD_BYTES:
+        samples = SamplesInMemory(Rows(samples, rows).read(0, samples.shape[0]))
+        rows = torch.arange(len(rows))
+    return [Rows(samples, part) for part in rows.split(sizes)]
+
+
+def _motion(predicted: Predicted, expressions: int) -> tuple[Tensor, Tensor]:
+    """Mean of the squared offset of each vertex in each expression, (N,V); rows of the N·V that anyone moves, (P,)."""
     count, size, _ = predicted.shape
-    first = predicted.read(0, 1)[0]
-    furthest, apart = torch.zeros_like(first), torch.zeros_like(first)
-    squared = torch.zeros(size, dtype=torch.float64)
+    furthest, squared = torch.zeros(2, size, dtype=torch.float64)
     for begin, end in blocks(predicted):
         part = predicted.read(begin, end)
         if not bool(torch.isfinite(part.sum())):
             bad = (~torch.isfinite(part)).flatten(1).any(1).nonzero()[:, 0] + begin
             raise ValueRangeError(f"expressions: number {int(bad[0])} holds NaN or infinity; expected none")
         squared += part.square().sum((0, -1))
-        torch.maximum(furthest, part.abs().amax(0), out=furthest)
-        torch.maximum(apart, part.sub_(first).abs_().amax(0), out=apart)
-    places = (furthest.amax(-1) > STILL).nonzero()[:, 0] if predicted.form == "offsets" else torch.arange(size)
-    differs = bool((apart[places] > STILL).any())
-    return _Motion((squared / count).unflatten(0, (expressions, -1)), places, differs)
+        torch.maximum(furthest, part.abs().amax((0, -1)), out=furthest)
+    places = (furthest > STILL).nonzero()[:, 0] if predicted.form == "offsets" else torch.arange(size)
+    return (squared / count).unflatten(0, (expressions, -1)), places
 
 
-def _considered(motion: _Motion, region: Tensor | None, form: Form) -> Tensor:
-    """Rows of the vertices to learn from: the region's, or those that move in some expression, all where none does."""
-    vertices = motion.squared.shape[1]
+def _considered(squared: Tensor, region: Tensor | None, form: Form) -> Tensor:
+    """Masks (N,V) of the vertices to learn from: the region's, or those that move in an expression, all where none
+    does."""
     if region is None:
-        moved = motion.squared.sqrt()
-        region = (moved > _MOVES * moved.amax(1, keepdim=True)).any(0)
-        if form == "expressions" or not bool(region.any()):
-            region = torch.ones(vertices, dtype=torch.bool)
-    if region.dtype != torch.bool or region.shape != (vertices,) or not bool(region.any()):
+        moved = squared.sqrt()
+        masks = moved > _MOVES * moved.amax(1, keepdim=True)
+        return masks | (~masks.any(1, keepdim=True) if form == "offsets" else True)
+    if region.dtype != torch.bool or region.shape != squared.shape[1:] or not bool(region.any()):
         raise ShapeError(f"region: found {region.dtype} {tuple(region.shape)}, expected a mask (V,), not empty")
-    return region.nonzero()[:, 0]
+    return region.expand(squared.shape)
 
 
-def _components_or_mean(moving: MovingPlaces, motion: _Motion, most: int, progress: Progress) -> PrincipalComponents:
-    """Principal components; none where all people make the same offsets."""
-    if motion.differs:
-        return principal_components(moving, most, progress=progress)
-    count, places, _ = moving.shape
+def _components_or_mean(samples: Samples, most: int | None) -> PrincipalComponents:
+    """Principal components; none where people do not differ."""
+    count, places, _ = samples.shape
+    first = samples.read(0, 1)
     total = torch.zeros(places * 3, dtype=torch.float64)
-    for begin, end in blocks(moving) if places else ():
-        total += moving.read(begin, end).flatten(1).sum(0, dtype=torch.float64)
+    differs = False
+    for begin, end in blocks(samples):
+        part = samples.read(begin, end)
+        differs = differs or bool(((part - first).abs() > STILL).any())
+        total += part.flatten(1).sum(0, dtype=torch.float64)
+    if differs:
+        return principal_components(samples, most)
     none = torch.zeros(0, places * 3, dtype=torch.float64)
     return PrincipalComponents(total / count, none, none.new_zeros(0), 0.0)
 

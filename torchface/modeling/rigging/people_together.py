@@ -41,25 +41,20 @@ def _of(poses: Similarity, begin: int, end: int) -> Similarity:
 
 
 @dataclass(frozen=True, eq=False)
-class NeutralRegion:
-    """The part of each neutral that is learned from, (M,R,3) float32, aligned with the others."""
+class Aligned:
+    """Neutrals (M,V,3) float64, aligned with each other."""
 
     neutrals: Samples  # (M,V,3)
     poses: Similarity  # of `align_neutrals`
-    rows: Tensor  # which vertices, (R,)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """M, R, 3."""
-        return (self.neutrals.shape[0], len(self.rows), 3)
+        """M, V, 3."""
+        return self.neutrals.shape
 
     def read(self, begin: int, end: int) -> Tensor:
         """See ``Samples``."""
-        part = torch.empty(end - begin, *self.shape[1:])
-        for first, last in _within(self.neutrals, begin, end):
-            aligned = _of(self.poses, first, last).apply(self.neutrals.read(first, last).double())
-            part[first - begin : last - begin] = aligned[:, self.rows]
-        return part
+        return _of(self.poses, begin, end).apply(self.neutrals.read(begin, end).double())
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,26 +82,22 @@ class Predicted:
 
 
 @dataclass(frozen=True, eq=False)
-class MovingPlaces:
-    """Those places of what is to be predicted that someone moves, (M,P,3) float32."""
+class Rows:
+    """Some vertices of samples, (M,R,3) float32; whole samples are read a few at a time."""
 
-    predicted: Predicted  # (M,N·V,3)
-    places: Tensor  # which rows, (P,)
+    samples: Samples  # (M,V,3)
+    rows: Tensor  # which, (R,)
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """M, P, 3."""
-        return (self.predicted.shape[0], len(self.places), 3)
+        """M, R, 3."""
+        return (self.samples.shape[0], len(self.rows), 3)
 
     def read(self, begin: int, end: int) -> Tensor:
         """See ``Samples``."""
         part = torch.empty(end - begin, *self.shape[1:])
-        for first, last in _within(self.predicted, begin, end):
-            part[first - begin : last - begin] = self.predicted.read(first, last)[:, self.places]
+        size = next(iter(blocks(self.samples)))[1]
+        for first in range(begin, end, size):
+            last = min(first + size, end)
+            part[first - begin : last - begin] = self.samples.read(first, last)[:, self.rows]
         return part
-
-
-def _within(samples: Samples, begin: int, end: int) -> list[tuple[int, int]]:
-    """Blocks of whole samples between two numbers: what is wanted of them may be a small part."""
-    rows = next(iter(blocks(samples)))[1]
-    return [(first, min(first + rows, end)) for first in range(begin, end, rows)]
