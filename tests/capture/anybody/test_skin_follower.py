@@ -109,6 +109,16 @@ def test_a_lost_face_and_a_reset_leave_weights_alone(rig: BlendshapeRig, filmed:
     assert not SkinFollower(rig, part_of("skin")).followed(pictures[0], nobody, 1 / FPS).any()
 
 
+def test_who_takes_over_is_followed_as_the_first_one_was(rig: BlendshapeRig, filmed: Film) -> None:
+    pictures, states = shown(filmed), solved(rig.names, LACKS * planted(rig.names), filmed.poses)
+    others, given = [255 - picture for picture in pictures], torch.stack([state.weights for state in states])
+    follower = SkinFollower(rig, part_of("skin"))
+    followed(follower, pictures, states, 3)
+    late, first = (followed(one, others, states, 6) - given for one in (follower, SkinFollower(rig, part_of("skin"))))
+    moves = [(one - one.mean(0))[:, ROWS].square().mean().sqrt() for one in (late, first)]
+    assert moves[0] > 0.7 * moves[1]
+
+
 def test_what_covers_skin_says_nothing(rig: BlendshapeRig, filmed: Film) -> None:
     pictures, states = shown(filmed), solved(rig.names, LACKS * planted(rig.names), filmed.poses)
     found = followed(SkinFollower(rig, part_of("hand")), pictures, states, 3)

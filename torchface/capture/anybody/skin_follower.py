@@ -28,6 +28,7 @@ _LASTS = 150.0  # frames in whose mean the reference is
 _KNOWN, _REMEMBERED = 30.0, 600.0  # frames that a mean change of 0 counts as, and in whose mean a change is
 _UNSEEN = torch.tensor([name.startswith(UNSEEN) for name in ARKIT])
 _CALM = OneEuroSettings(1.0, 8.0, 3.0)
+_ANOTHER = 2.0  # millimetres of mean error, from which the reference shows another person: a hand leaves up to 1.6
 
 
 class SkinFollower:
@@ -87,6 +88,8 @@ class SkinFollower:
 
     def _look(self, frame: Tensor, state: WebcamState, since: float) -> None:
         """Takes a frame into the reference and the change."""
+        if self._error > _ANOTHER:
+            self.reset()
         pose = (state.pose[:9].reshape(3, 3), state.pose[9:])
         calibration = assumed_calibration(frame.shape[2], frame.shape[1])
         picture, seen, at = self._face.seen_in(frame, state.shapes, pose, calibration)
