@@ -9,7 +9,15 @@ from torch import Tensor
 from torchface.geometry.meshes.rasterization import rasterise_uvs
 from torchface.mesh import Mesh
 from torchface.registration import register, with_template_skin
-from torchface.registration.scan_colors import ScanColors, own_colors, resampled_texture, skin_base, with_edge_of_hair
+from torchface.registration.scan_colors import (
+    ScanColors,
+    in_shade,
+    own_colors,
+    resampled_texture,
+    skin_base,
+    with_edge_of_hair,
+)
+from torchface.synthetic import performer
 
 
 def paint(points: Tensor) -> Tensor:
@@ -115,6 +123,17 @@ def test_hair_beside_what_is_unseen_is_not_shown_and_a_mole_is(mask: Mesh) -> No
     assert not bool(covered[height < height.max() - 60].any())
     bare = torch.full_like(colors, 0.6)
     assert torch.equal(with_edge_of_hair(unseen, bare, ~unseen, mask.faces), unseen)  # a hole in the scan
+
+
+def test_nostrils_that_no_scan_shows_are_dark_inside() -> None:
+    head = performer(texture=False).neutral
+    colors, nothing = torch.full((len(head.vertices), 3), 0.6), torch.zeros(len(head.vertices), dtype=torch.bool)
+    shaded = in_shade(colors, head, nothing)
+    nostrils, nose = (head.regions[name] for name in ("nostrils", "nose"))
+    assert float(shaded[nostrils].mean()) < 0.3
+    tip = nose & (head.vertices[:, 2] > head.vertices[nose, 2].max() - 5)
+    assert torch.equal(shaded[tip], colors[tip])
+    assert torch.equal(in_shade(colors, head, ~nothing), colors)  # what a scan shows
 
 
 def test_what_is_unseen_has_the_templates_texture_in_the_tone_of_the_skin_alone(mask: Mesh) -> None:

@@ -14,7 +14,7 @@ from torchface.geometry.meshes.rasterization import interpolate, rasterise_uvs
 from torchface.geometry.meshes.surface_index import SurfacePoints
 from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.mesh import Mesh
-from torchface.rendering.clay_shading import sample_texture
+from torchface.rendering.clay_shading import sample_texture, vertex_openness
 from torchface.rendering.raycast import RayCaster
 
 _REACH = 5.0
@@ -22,6 +22,7 @@ _BLEND = 10.0
 _MAX_ANGLE = 75.0
 _LEAST, _FINEST = 0.02, 5.0  # of a colour; times brighter or darker than between vertices
 _DARK = 0.25  # of the skin's light
+_OPEN, _DEEP = 0.5, 0.3  # how open a place is, of 1, from which it is not in shade; of the skin's colour, at least
 _STRANDS, _SHADOW = 3, 2  # rings of vertices
 
 
@@ -69,6 +70,12 @@ def vertex_colors(source: ScanColors, nearest: SurfacePoints, trusted: Tensor) -
         _, row = cKDTree(known.numpy()).query(nearest.points[~trusted].numpy())
         colors[~trusted] = colors[trusted][torch.from_numpy(row)]
     return colors.clamp(0, 1)
+
+
+def in_shade(colors: Tensor, mesh: Mesh, matched: Tensor) -> Tensor:
+    """Colours (V,3) of a mesh's vertices, darker inside nostrils and the mouth, where nothing is ``matched``, (V,)."""
+    shade = (vertex_openness(mesh) / _OPEN).clamp(_DEEP, 1)
+    return colors * torch.where(matched, 1.0, shade)[:, None]
 
 
 def skin_base(colors: Tensor, template: Mesh, seen: Tensor) -> Tensor:

@@ -24,6 +24,7 @@ from torchface.registration.nonrigid.unfolding import grown
 from torchface.registration.scan_colors import (
     ScanColors,
     has_colors,
+    in_shade,
     resampled_texture,
     shown_share,
     skin_base,
@@ -311,6 +312,7 @@ def _colored(
     # The last skin before hair is in its shadow: the fill starts where the scan's colours count in full.
     filled = completed_colors(colors, skin_base(colors, template, matched), place, faces, shown < 1)
     colors = torch.lerp(filled, colors, shown[:, None])
+    filled, colors = (in_shade(one, mesh, matched) for one in (filled, colors))
     texture = resampled_texture(mesh, template, filled, shown, source, size) if size and mesh.uvs is not None else None
     device = mesh.vertices.device
     return replace(mesh, colors=colors.to(device), texture=None if texture is None else texture.to(device))
