@@ -119,6 +119,16 @@ def test_who_takes_over_is_followed_as_the_first_one_was(rig: BlendshapeRig, fil
     assert moves[0] > 0.7 * moves[1]
 
 
+def test_lids_that_are_shut_do_not_rise(rig: BlendshapeRig, filmed: Film) -> None:
+    lid, risen = (ARKIT.index(name) for name in ("eyeBlinkLeft", "eyeWideLeft"))
+    states = solved(rig.names, LACKS * planted(rig.names), filmed.poses)
+    shut = [replace(state, weights=state.weights.index_fill(0, torch.tensor(lid), 0.3)) for state in states]
+    opened, found = (followed(SkinFollower(rig, part_of("skin")), shown(filmed), given, 3) for given in (states, shut))
+    assert opened[:, risen].max() > 0.01
+    assert not found[:, risen].any()
+    torch.testing.assert_close(found[:, lid], torch.full((FRAMES,), 0.3))
+
+
 def test_what_covers_skin_says_nothing(rig: BlendshapeRig, filmed: Film) -> None:
     pictures, states = shown(filmed), solved(rig.names, LACKS * planted(rig.names), filmed.poses)
     found = followed(SkinFollower(rig, part_of("hand")), pictures, states, 3)
