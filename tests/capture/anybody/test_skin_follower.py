@@ -44,7 +44,13 @@ def solved(names: tuple[str, ...], weights: Tensor, poses: tuple[Tensor, Tensor]
     start = StateLayout(len(names), 4).start()
     to_arkit = mapping(names, ARKIT)
     return [
-        replace(start, shapes=row, weights=to_arkit @ row, pose=torch.cat([turn.flatten(), at]).float())
+        replace(
+            start,
+            shown=torch.tensor(9.0),
+            shapes=row,
+            weights=to_arkit @ row,
+            pose=torch.cat([turn.flatten(), at]).float(),
+        )
         for row, turn, at in zip(weights, *poses, strict=True)
     ]
 
@@ -75,6 +81,7 @@ def test_skin_says_what_weights_lack(rig: BlendshapeRig, filmed: Film) -> None:
         assert 0.1 < change @ lacks / lacks.square().sum() < 1.1
     moves = [(one - one.mean(0) - truth + truth.mean(0))[:, ROWS].square().mean().sqrt() for one in (given, found)]
     assert moves[1] < 0.8 * moves[0]
+    assert (found - given)[:, ROWS].mean(0).abs().max() < 0.06  # the first frames are no more than others
     blinks = [row for row, name in enumerate(ARKIT) if name.startswith("eyeBlink")]
     assert not found[:, blinks].any()
     assert 0 <= float(found.min()) <= float(found.max()) <= 1
@@ -127,6 +134,35 @@ def test_lids_that_are_shut_do_not_rise(rig: BlendshapeRig, filmed: Film) -> Non
     assert opened[:, risen].max() > 0.01
     assert not found[:, risen].any()
     torch.testing.assert_close(found[:, lid], torch.full((FRAMES,), 0.3))
+
+
+def test_a_face_is_looked_at_when_it_has_been_there_for_a_second(rig: BlendshapeRig, filmed: Film) -> None:
+    """What the first solves of a face are off by is no reference."""
+    states = solved(rig.names, LACKS * planted(rig.names), filmed.poses)
+    pictures, follower = shown(filmed), SkinFollower(rig, part_of("skin"))
+    new = [replace(state, shown=torch.tensor(0.9)) for state in states]
+    torch.testing.assert_close(followed(follower, pictures, new, 3), torch.stack([one.weights for one in new]))
+    assert (followed(follower, pictures, states, 2)[-1] - states[-1].weights).abs().max() > 0.01
+
+
+def test_pictures_with_opacity_or_mirrored_are_followed_alike(rig: BlendshapeRig, filmed: Film) -> None:
+    pictures, states = shown(filmed), solved(rig.names, LACKS * planted(rig.names), filmed.poses)
+    opaque = [np.concatenate([picture, picture[..., :1]], 2) for picture in pictures]
+    views = [np.ascontiguousarray(picture[:, ::-1])[:, ::-1] for picture in pictures]
+    plain, *others = (followed(SkinFollower(rig, part_of("skin")), one, states, 1) for one in (pictures, opaque, views))
+    for other in others:
+        torch.testing.assert_close(other, plain)
+
+
+def test_smoothing_calms_what_the_skin_says(rig: BlendshapeRig, filmed: Film) -> None:
+    pictures, states = shown(filmed), solved(rig.names, LACKS * planted(rig.names), filmed.poses)
+    steps = []
+    for smoothing in (0.0, 0.5, 1.0):
+        follower, controls = SkinFollower(rig, part_of("skin")), WebcamControls(smoothing=smoothing)
+        rows = [follower.followed(*given, 1 / FPS, controls) for given in zip(pictures * 2, states * 2, strict=True)]
+        changes = torch.stack(rows) - torch.stack([state.weights for state in states * 2])
+        steps.append(float(changes.diff(dim=0).norm()))
+    assert steps[0] > 1.1 * steps[1] > 1.2 * steps[2]
 
 
 def test_what_covers_skin_says_nothing(rig: BlendshapeRig, filmed: Film) -> None:

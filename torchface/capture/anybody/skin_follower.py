@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from torchface.capture.anybody.guided_gains import gain_factors, gain_groups
+from torchface.capture.anybody.webcam_outputs import OCTAVES
 from torchface.capture.anybody.webcam_state import WebcamControls, WebcamState
 from torchface.capture.own_rig.eye_geometry import arkit_names
 from torchface.capture.own_rig.flat_face import FlatFace
@@ -21,13 +22,14 @@ from torchface.temporal.one_euro import OneEuroSettings, one_euro_step
 
 _STEP = 1.0  # millimetres a pixel of the flat face
 _SOONEST = 1 / 40  # seconds after which the skin is looked at again: cameras of 60 frames a second need no more
-_GROWS, _CEASES = 2.0, 0.4  # seconds in which the skin comes to count as a face appears, and ceases to as one is lost
+_SETTLED = 1.0  # seconds of a face after which its first solves have come to rest: the reference begins
+_GROWS, _CEASES = 1.0, 0.4  # seconds in which the skin comes to count as a face appears, and ceases to as one is lost
 _LOOKS, _APART = 10, 30  # in which parts are found, and the frames from one to the next
 _RENEWED = 10  # frames after which the reference is renewed; in the beginning at once
 _LASTS = 150.0  # frames in whose mean the reference is
 _KNOWN, _REMEMBERED = 30.0, 600.0  # frames that a mean change of 0 counts as, and in whose mean a change is
 _UNSEEN = torch.tensor([name.startswith(UNSEEN) for name in ARKIT])
-_CALM = OneEuroSettings(1.0, 8.0, 3.0)
+_CALM = OneEuroSettings(0.5, 8.0, 3.0)
 _ANOTHER = 2.0  # millimetres of mean error, from which the reference shows another person: a hand leaves up to 1.6
 
 
@@ -35,7 +37,8 @@ class SkinFollower:
     """Follows the skin of one person from frame to frame, as ``skin_motion`` does in a whole take.
 
     The reference is the running mean of the frames, each brought onto it, so that it needs none that are yet to come:
-    in the first seconds it is what the first frames show. A change counts beside the mean of those before it.
+    it begins when a face has been there for a second, and anew where another person takes over. A change counts beside
+    the mean of those before it.
 
     Args:
         rig: that the frames' states are of, upright, in millimetres, with iBUG's 68 landmarks.
@@ -66,7 +69,7 @@ class SkinFollower:
         """A frame's weights by ARKit's names, (52,) in [0,1], as the skin changes those of its state.
 
         Args:
-            picture: the frame, uint8 (H,W,3), red first.
+            picture: the frame, uint8 (H,W,3) or (H,W,4), red first.
             state: that was solved of it.
             interval: seconds since the frame before.
             controls: what the user asks for.
@@ -74,11 +77,13 @@ class SkinFollower:
         controls = controls or WebcamControls()
         if controls.reset:
             self.reset()
-        face = float(state.lost) == 0 and bool(state.pose.any())
+        face = float(state.lost) == 0 and float(state.shown) >= _SETTLED
         self._counts += (float(face) - self._counts) * (1 - math.exp(-interval / (_GROWS if face else _CEASES)))
         self._since += interval
         if face and self._since >= _SOONEST:
-            self._look(torch.from_numpy(picture).permute(2, 0, 1), state, min(self._since, 1.0))
+            opening = 2 ** (OCTAVES * (0.5 - controls.smoothing))
+            frame = torch.from_numpy(np.ascontiguousarray(picture[..., :3])).permute(2, 0, 1)
+            self._look(frame, state, min(self._since, 1.0), opening)
             self._since = 0.0
         shown = controls.gain * self._change.double() / gain_factors(state.gains.double(), self._groups)
         added = self._counts * (self._to_arkit @ shown)
@@ -86,7 +91,7 @@ class SkinFollower:
         changed = unless_shut(weights, (weights + added).clamp(0, 1), ARKIT, _UNSEEN)
         return changed.to(state.weights)
 
-    def _look(self, frame: Tensor, state: WebcamState, since: float) -> None:
+    def _look(self, frame: Tensor, state: WebcamState, since: float, opening: float) -> None:
         """Takes a frame into the reference and the change."""
         if self._error > _ANOTHER:
             self.reset()
@@ -108,7 +113,7 @@ class SkinFollower:
             self._usual += (found - self._usual) / (min(self._frames, _REMEMBERED) + _KNOWN)
             change = torch.zeros_like(self._change)
             change[by.shapes] = torch.from_numpy(found - self._usual).float()
-            self._change, self._speed = one_euro_step(change, self._change, self._speed, since, _CALM)
+            self._change, self._speed = one_euro_step(change, self._change, self._speed, since, _CALM, opening=opening)
         share = seen + 0.25
         self._share = np.minimum(self._share + share, _LASTS)
         self._mean += (brought - self._mean) * (share / self._share)

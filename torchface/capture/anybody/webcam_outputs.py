@@ -15,7 +15,8 @@ from torchface.temporal.one_euro import WEBCAM_ONE_EURO, one_euro_step
 _HOLD, _RELAX = 0.3, 0.5
 """For how long a lost face is held, and how long it then takes to rest, seconds."""
 _MISFIT, LOST_FIT = 0.06, 0.14  # of the eyes' distance
-_OCTAVES = 4.0  # of the filter's cutoff, between no smoothing to speak of and the most
+OCTAVES = 4.0
+"""Of the filter's cutoff, between no smoothing to speak of and the most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +72,7 @@ def calmed_state(
     speeds = torch.where(first, 0.0, before.speeds)
     old = torch.cat([before.weights, torch.zeros_like(motion)])
     unit = outputs.filter_units
-    latest, opening = torch.cat([weights, motion]), torch.exp2(_OCTAVES * (0.5 - smoothing))
+    latest, opening = torch.cat([weights, motion]), torch.exp2(OCTAVES * (0.5 - smoothing))
     calm, speeds = one_euro_step(latest, old, speeds, interval, WEBCAM_ONE_EURO, unit, opening)
     calm = torch.where(smoothing > 0, calm, latest)
     rotation = torch.where(first, turned, rotation_matrix(calm[-6:-3]) @ before.rotation)
