@@ -11,7 +11,7 @@ from torch import Tensor
 
 from planted.skin_films import FRAMES, HEIGHT, MOVED, WIDTH, Film, film_of, part_of, planted
 from torchface.capture.antagonist_shapes import signed_quantities
-from torchface.capture.anybody import WebcamControls, WebcamState
+from torchface.capture.anybody import WebcamControls, WebcamState, skin_follower
 from torchface.capture.anybody.guided_gains import gain_groups
 from torchface.capture.anybody.skin_follower import SkinFollower
 from torchface.capture.anybody.webcam_state import GROUPS, StateLayout
@@ -163,6 +163,22 @@ def test_smoothing_calms_what_the_skin_says(rig: BlendshapeRig, filmed: Film) ->
         changes = torch.stack(rows) - torch.stack([state.weights for state in states * 2])
         steps.append(float(changes.diff(dim=0).norm()))
     assert steps[0] > 1.1 * steps[1] > 1.2 * steps[2]
+
+
+def test_no_smoothing_leaves_each_frame_to_itself(
+    rig: BlendshapeRig, filmed: Film, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a filter makes of a frame depends on how long ago the last one was."""
+    pictures, states = shown(filmed), solved(rig.names, LACKS * planted(rig.names), filmed.poses)
+    monkeypatch.setattr(skin_follower, "_GROWS", 1e-6)  # at once in full
+
+    def played(fps: float, smoothing: float) -> Tensor:
+        follower, controls = SkinFollower(rig, part_of("skin")), WebcamControls(smoothing=smoothing)
+        rows = [follower.followed(*given, 1 / fps, controls) for given in zip(pictures, states, strict=True)]
+        return torch.stack(rows)
+
+    torch.testing.assert_close(played(30, 0.0), played(10, 0.0))
+    assert (played(30, 0.5) - played(10, 0.5)).abs().max() > 0.005
 
 
 def test_what_covers_skin_says_nothing(rig: BlendshapeRig, filmed: Film) -> None:

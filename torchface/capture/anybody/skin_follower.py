@@ -81,7 +81,7 @@ class SkinFollower:
         self._counts += (float(face) - self._counts) * (1 - math.exp(-interval / (_GROWS if face else _CEASES)))
         self._since += interval
         if face and self._since >= _SOONEST:
-            opening = 2 ** (OCTAVES * (0.5 - controls.smoothing))
+            opening = 2 ** (OCTAVES * (0.5 - controls.smoothing)) if controls.smoothing > 0 else math.inf
             frame = torch.from_numpy(np.ascontiguousarray(picture[..., :3])).permute(2, 0, 1)
             self._look(frame, state, min(self._since, 1.0), opening)
             self._since = 0.0
