@@ -98,7 +98,9 @@ class InnerParts:
         rows = (caster.distances(points, -outward, float(far.max())) < far).nonzero()[:, 0]
         hits = caster.cast(points[rows], -outward[rows])
         entered = (triangle_normals(vertices, self.skin[hits.triangle]) * outward[rows]).sum(-1) > 0
-        through = (hits.triangle >= 0) & entered & ~caster.occluded(points[rows], outward[rows])
+        # A ray along an edge may meet it in one query and pass it in the next.
+        before = hits.distance < far[rows]
+        through = before & entered & ~caster.occluded(points[rows], outward[rows])
         way, triangle = torch.zeros_like(far), torch.full((len(points),), -1)
         way[rows[through]], triangle[rows[through]] = hits.distance[through], hits.triangle[through]
         # The way along the ray is never shorter than the nearest one.
