@@ -106,7 +106,8 @@ class InnerParts:
         # The way along the ray is never shorter than the nearest one.
         depth, deep = way.clone(), way > TOLERANCE / 2
         if deep.any():
-            depth[deep] = SurfaceIndex(vertices, self.skin).among_nearest_samples(points[deep], 12).distance
+            beside = _within(vertices, self.skin, points[deep], way[deep])
+            depth[deep] = SurfaceIndex(vertices, beside).among_nearest_samples(points[deep], 12).distance
         return Standing(depth, outward, triangle, way)
 
     def middles(self, vertices: Tensor) -> Tensor:
@@ -114,6 +115,14 @@ class InnerParts:
         count = int(self.group.max()) + 1 if len(self.group) else 0
         total = vertices.new_zeros(count, 3).index_add_(0, self.group, vertices[self.vertices])
         return total / self.group.bincount(minlength=count)[:, None]
+
+
+def _within(vertices: Tensor, faces: Tensor, points: Tensor, reach: Tensor) -> Tensor:
+    """The faces, and some others, of which a point lies within the reach (Q,) of one of the points (Q,3)."""
+    corners = vertices[faces]
+    centres = corners.mean(1)
+    sizes = (corners - centres[:, None]).norm(dim=-1).amax(1)
+    return faces[(torch.cdist(points, centres) <= reach[:, None] + sizes).any(0)]
 
 
 def inner_parts(template: BlendshapeRig) -> InnerParts:
