@@ -5,7 +5,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from torchface.capture.own_rig.another_face import AnotherFace, other_faces
+from torchface.capture.own_rig.another_face import AnotherFace, FilmLooks, other_faces
 
 NUMBERS = 300
 BOX = torch.tensor([100.0, 100, 50, 50])
@@ -23,9 +23,11 @@ def person(seed: int, frames: int = 30) -> tuple[Tensor, Tensor]:
     return normalize(looks, dim=1), relative
 
 
-def film(*spans: tuple[Tensor, Tensor]) -> list[AnotherFace]:
+def film(*spans: tuple[Tensor, Tensor], cut: float = 0.5) -> list[AnotherFace]:
+    """Spans of pictures that change by so much where one goes over to the next, and hardly at all within."""
     looks, relative = (torch.cat(parts) for parts in zip(*spans, strict=True))
-    return other_faces(looks, relative, torch.ones(len(looks), 68), BOX.expand(len(looks), 4))
+    changes = torch.cat([torch.tensor([cut] + [0.002] * len(part))[: len(part)] for part, _ in spans])
+    return other_faces(FilmLooks(looks, changes), relative, torch.ones(len(looks), 68), BOX.expand(len(looks), 4))
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
@@ -46,6 +48,17 @@ def test_one_face_is_one_face() -> None:
     share = torch.tensor([0.2, 0.5, 0.8, 1, 1, 1, 1, 1, 1, 1, 1, 1, 0.8, 0.5, 0.2])[:, None]
     hidden = normalize((1 - 0.7 * share) * looks[:15] + 0.7 * share * hand, dim=1)
     assert film((looks, relative), (hidden, relative[:15]), (looks, relative)) == []
+
+
+def test_a_hand_before_the_face_is_no_cut() -> None:
+    """The face looks otherwise from one frame to the next, its landmarks lie elsewhere; most of the picture stays."""
+    first, other = person(7), person(8)
+    assert [(span.first, span.last) for span in film(first, other)] == [(30, 59)]
+    assert film(first, other, cut=0.015) == []
+    looks, relative = (torch.cat(parts) for parts in zip(first, other, strict=True))
+    changes = torch.full((60,), 0.002)
+    changes[29:32] = torch.tensor([0.053, 0.05, 0.026])  # a hand that takes three frames
+    assert other_faces(FilmLooks(looks, changes), relative, torch.ones(60, 68), BOX.expand(60, 4)) == []
 
 
 def test_spans_between_cuts_and_losses_are_judged() -> None:

@@ -10,6 +10,7 @@ from forked_runs import killed
 from safetensors.torch import load_file
 
 from tests.workflows.track.conftest import FRAMES, PIECE, Done, Filmed
+from torchface.capture.own_rig.another_face import FilmLooks
 from torchface.io.gltf.animation_reading import read_gltf_weights
 from torchface.io.video import open_video
 from torchface.io.video.video_file import VideoFile
@@ -109,7 +110,7 @@ def test_pieces_of_other_runs_and_damaged_ones_are_thrown_away(tmp_path: Path) -
     piece = FaceReading(torch.rand(4, 68, 2), torch.rand(4, 68), torch.ones(4, 68), torch.ones(4))
     state = TrackState(tmp_path, "a")
     for _ in range(3):
-        state.append(piece, torch.rand(4, 1200), torch.zeros(3))
+        state.append(piece, FilmLooks(torch.rand(4, 1200), torch.rand(4)), torch.zeros(3))
     assert TrackState(tmp_path, "a").done == 12
     files = sorted((tmp_path / FOLDER).glob("*.safetensors"))
     files[1].write_bytes(files[1].read_bytes()[:-1000] + bytes(1000))

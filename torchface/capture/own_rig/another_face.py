@@ -10,8 +10,11 @@ from torch import Tensor
 from torchface.capture.own_rig.face_points import LANDMARKS
 
 # A cut: the look correlates by less than the first with that of the frame before, and both frames by more than the
-# second with their other neighbours. A hand that comes before a face changes its look in several frames.
+# second with their other neighbours.
 _CUT, _STEADY = 0.93, 0.95
+# The whole picture changes with it, 1 less the correlation, and so many times as much as before and afterwards: a hand
+# that comes before a face takes several frames.
+_CHANGE, _SUDDEN = 0.02, 4.0
 _MOVED, _GROWN = 1.0, 1.6  # by sides of its box, and by what factor of them: further than a face moves in a frame
 _LOST = 10  # frames without a face after which a tracker takes any
 _LEAST_FRAMES = 8  # of a span that is judged: a hand before the face looks like nobody
@@ -22,6 +25,21 @@ _MOST_FRAMES = 200  # of each side that are compared
 _LOOK, _LANDMARKS, _MOST = 0.25, 0.03, 0.72
 _ALIKE = 0.97  # looks of the same frame of a face, whatever hides of it
 _EYES_NOSE = slice(27, 48)
+
+
+@dataclass(frozen=True, eq=False)
+class FilmLooks:
+    """How a film and a face in it look.
+
+    Args:
+        faces: of each frame's face, (T,C) of unit length, see
+            :func:`~torchface.landmarks.images.tracking.followed_face.face_look`; NaN where none was found.
+        changes: of the pictures from the frame before, (T,), see
+            :func:`~torchface.landmarks.images.picture_cut.sudden_change`.
+    """
+
+    faces: Tensor
+    changes: Tensor
 
 
 @dataclass(frozen=True)
@@ -42,16 +60,14 @@ class _Span:
     places: Tensor
 
 
-def other_faces(looks: Tensor, relative: Tensor, trust: Tensor, boxes: Tensor) -> list[AnotherFace]:
+def other_faces(looks: FilmLooks, relative: Tensor, trust: Tensor, boxes: Tensor) -> list[AnotherFace]:
     """Which spans of a film show another face than its first span does.
 
-    A film is cut where a face's look or place changes from one frame to the next, or where it was lost for ten. Each
-    span of eight frames or more is compared with all that showed the first face, by the frames that look most alike and
-    by the median places of eyes and nose.
+    A film is cut where the picture, and a face's look or place in it, change in one frame, or where the face was lost
+    for ten. Each span of eight frames or more is compared with all that showed the first face, by the frames that look
+    most alike and by the median places of eyes and nose.
 
     Args:
-        looks: of each frame's face, (T,C) of unit length, see
-            :func:`~torchface.landmarks.images.tracking.followed_face.face_look`; NaN where none was found.
         relative: landmarks beside a robust fit of the rig's to each frame, (T,68,2) in distances of the eyes, see
             :func:`~torchface.capture.own_rig.outlier_landmarks.landmark_residuals`.
         trust: of the landmarks, (T,68).
@@ -59,7 +75,7 @@ def other_faces(looks: Tensor, relative: Tensor, trust: Tensor, boxes: Tensor) -
     """
     others: list[AnotherFace] = []
     known: list[_Span] = []
-    for span in _spans(looks, relative, trust, _cuts(looks, boxes)):
+    for span in _spans(looks.faces, relative, trust, _cuts(looks, boxes)):
         if not known:
             known.append(span)
             continue
@@ -72,18 +88,21 @@ def other_faces(looks: Tensor, relative: Tensor, trust: Tensor, boxes: Tensor) -
     return others
 
 
-def _cuts(looks: Tensor, boxes: Tensor) -> Tensor:
+def _cuts(looks: FilmLooks, boxes: Tensor) -> Tensor:
     """Frames (T,) bool at which a film may go over to another face; the first is one."""
-    alike = torch.ones(len(looks) + 1)
-    alike[1:-1] = (looks[1:] * looks[:-1]).sum(1)  # NaN where one of the two was not found
+    faces, changes = looks.faces, looks.changes
+    alike = torch.ones(len(faces) + 1)
+    alike[1:-1] = (faces[1:] * faces[:-1]).sum(1)  # NaN where one of the two was not found
     cuts = (alike[:-1] < _CUT) & (alike[1:] > _STEADY)
     cuts[1:] &= alike[:-2] > _STEADY
     side, middle = boxes[:, 2], boxes[:, :2] + boxes[:, 2:] / 2
     grown = (side[1:] / side[:-1]).log().abs() > math.log(_GROWN)
     moved = (middle[1:] - middle[:-1]).norm(dim=1) > _MOVED * side[:-1]
     cuts[1:] |= (grown | moved) & (alike[1:-1] < _CUT)
+    around = torch.nn.functional.pad(changes, (1, 1))
+    cuts &= changes > (_SUDDEN * torch.maximum(around[:-2], around[2:])).clamp(min=_CHANGE)
     unseen = 0
-    for t, known in enumerate(torch.isfinite(looks).all(1).tolist()):
+    for t, known in enumerate(torch.isfinite(faces).all(1).tolist()):
         cuts[t] |= known and unseen >= _LOST
         unseen = 0 if known else unseen + 1
     cuts[:1] = True

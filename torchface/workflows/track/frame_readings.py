@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchface.capture.own_rig.another_face import FilmLooks
 from torchface.errors import ValueRangeError
 from torchface.io.landmarks.landmark_tables import load_landmark_table
 from torchface.io.video import VideoFile
@@ -78,16 +79,18 @@ def _track(
             at += sum(1 for _ in piece)
             progress("tracking landmarks", at, max(clip.count, at))
             continue
-        readings, looks = [], []
+        readings, looks, changes = [], [], []
         for frame in piece:  # a frame's box is the one before's
             with naming_the_frame(at):
                 readings.append(tracker.step(frame))
             looks.append(tracker.look)
+            changes.append(tracker.change)
             if at in kept:
                 pictures[at] = frame
             at += 1
             progress("tracking landmarks", at, max(clip.count, at))
-        state.append(FaceReading.stacked(readings), torch.stack(looks), tracker.memory)
+        seen = FilmLooks(torch.stack(looks), torch.tensor(changes))
+        state.append(FaceReading.stacked(readings), seen, tracker.memory)
     return faces
 
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from torchface.capture.antagonist_shapes import signed_difference, signed_quantities
 from torchface.capture.own_rig import FaceMeasurements, VideoSolution, VideoSolver
-from torchface.capture.own_rig.another_face import AnotherFace, other_faces
+from torchface.capture.own_rig.another_face import AnotherFace, FilmLooks, other_faces
 from torchface.capture.own_rig.eye_geometry import (
     CORNERS,
     LOOKS,
@@ -76,8 +76,8 @@ class JudgedReading:
     others: list[AnotherFace]  # spans of frames that show another face than the first ones; see `other_faces`
 
 
-def judged_reading(inputs: TrackInputs, reading: FaceReading, looks: Tensor | None) -> JudgedReading:
-    """The reading without outliers and other faces; faces' looks are (T,C), None where nobody looked at pictures."""
+def judged_reading(inputs: TrackInputs, reading: FaceReading, looks: FilmLooks | None) -> JudgedReading:
+    """The reading without outliers and other faces; no looks where nobody looked at pictures."""
     rest, reach = landmark_reach(inputs.actor)
     outliers = outlier_landmarks(rest, reach, reading.landmarks, reading.trust, inputs.clip.fps)
     reading, others = reading.doubted(outliers), list[AnotherFace]()

@@ -184,8 +184,11 @@ class Tracked:
 
     def verdict(self) -> str:
         """Whether the result is to be used, in a line."""
-        count, seen, misfit = len(self), int(self.seen.sum()), self.misfit
+        count, misfit = len(self), self.misfit
+        another = sum(int(self.seen[span.first : span.last + 1].sum()) for span in self.others)
+        seen = int(self.seen.sum()) - another
         found = f"the face was found in {seen} of {count} frames ({100 * seen / count:.1f} %)"
+        found += f", another face in {another}" if another else ""
         if not seen:
             return f"result: none, {found}"
         fit = f"the solved face lies {100 * misfit:.1f} % of the eyes' distance from the landmarks"

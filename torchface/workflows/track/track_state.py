@@ -7,6 +7,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from torchface.capture.own_rig.another_face import FilmLooks
 from torchface.errors import FileFormatError
 from torchface.files.checkpoints import read_checkpoint, write_checkpoint
 from torchface.files.content_keys import content_key, file_digest
@@ -18,7 +19,7 @@ FOLDER = "state"
 """Where it lies in the folder of results."""
 
 _RECORD = "track.json"
-_METHOD = "tracked frames/9"
+_METHOD = "tracked frames/10"
 _MAX_PIECE_BYTES = 2**28
 _PARTS = fields(FaceReading)
 
@@ -36,6 +37,7 @@ class TrackState:
         self.key = key
         self._pieces: list[FaceReading] = []
         self._looks: list[Tensor] = []
+        self._changes: list[Tensor] = []
         self.memory = torch.zeros(0, dtype=torch.float64)
         """The tracker's after the frames that are kept."""
         self._take_up()
@@ -51,22 +53,24 @@ class TrackState:
         none = FaceReading(*(getattr(nobody, part.name)[:0] for part in _PARTS))
         return FaceReading.joined([none, *self._pieces])
 
-    def looks(self) -> Tensor:
-        """How the face looks in all frames that are kept, (T,C) of unit length; NaN where it was not found."""
+    def looks(self) -> FilmLooks:
+        """How the film and the face look in all frames that are kept."""
         looks = torch.cat(self._looks).float()
-        return torch.where(looks.any(1, keepdim=True), looks / looks.norm(dim=1, keepdim=True), torch.nan)
+        faces = torch.where(looks.any(1, keepdim=True), looks / looks.norm(dim=1, keepdim=True), torch.nan)
+        return FilmLooks(faces, torch.cat(self._changes))
 
-    def append(self, piece: FaceReading, looks: Tensor, memory: Tensor) -> None:
-        """Keeps the reading of the next frames (T,...), their looks (T,C), and the tracker's memory after them."""
+    def append(self, piece: FaceReading, looks: FilmLooks, memory: Tensor) -> None:
+        """Keeps the reading of the next frames (T,...), their looks, and the tracker's memory after them."""
         make_folder(self.folder)
         self.memory = memory
         # A byte a number is enough for a correlation.
-        largest = looks.abs().amax(1, keepdim=True).clamp(min=1e-9)
-        coarse = (127 * looks / largest).nan_to_num(0.0).round().to(torch.int8)
-        parts = {**vars(piece), "look": coarse, "memory": memory}
+        largest = looks.faces.abs().amax(1, keepdim=True).clamp(min=1e-9)
+        coarse = (127 * looks.faces / largest).nan_to_num(0.0).round().to(torch.int8)
+        parts = {**vars(piece), "look": coarse, "change": looks.changes, "memory": memory}
         write_checkpoint(self._path(len(self._pieces)), parts, self._piece_key())
         self._pieces.append(piece)
         self._looks.append(coarse)
+        self._changes.append(looks.changes)
 
     def is_current(self, product: Path, key: str) -> bool:
         """Whether a file is there, was made from what ``key`` says, and is as it was made; warns of a damaged one."""
@@ -92,6 +96,7 @@ class TrackState:
                 folder.rmdir()
         self._pieces.clear()
         self._looks.clear()
+        self._changes.clear()
 
     def _take_up(self) -> None:
         for left_over in self.folder.glob(".*.part"):
@@ -112,10 +117,11 @@ class TrackState:
             )
             return None
         tensors = read_checkpoint(path, self._piece_key())
-        if tensors is None or set(tensors) != {"memory", "look", *(part.name for part in _PARTS)}:
+        if tensors is None or set(tensors) != {"memory", "look", "change", *(part.name for part in _PARTS)}:
             return None
         self.memory = tensors.pop("memory")
         self._looks.append(tensors.pop("look"))
+        self._changes.append(tensors.pop("change"))
         return FaceReading(**tensors)
 
     def _piece_key(self) -> str:

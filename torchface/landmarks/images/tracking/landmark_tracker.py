@@ -108,6 +108,11 @@ class LandmarkTracker:
         return torch.full((LOOK,), torch.nan) if look is None or self._followed.missed > 0 else look
 
     @property
+    def change(self) -> float:
+        """By how much the latest frame's picture differs from the one before, 1 less their correlation."""
+        return self._followed.change
+
+    @property
     def beside(self) -> Tensor:
         """How many other people stand to the left of the face in the picture, and to the right, smoothed, (2,)."""
         return counted_beside(self._followed.people)
