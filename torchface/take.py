@@ -92,7 +92,8 @@ class Take:
         landmarks: values (T,L,2), pixels.
         weights: values (T,N,1), blendshape weights.
         timecode: one text a frame, as the file had it.
-        extras: what else the file holds (columns by name, device, subject), kept for writing it back.
+        extras: what else the file holds (columns by name, device, subject), kept for writing it back;
+            ``frame_numbers`` (T,) where :attr:`numbers` are not 0, 1, ...
         seconds: when each frame is shown, (T,), rising, from any beginning, where frames come unevenly (a camera of
             variable rate, dropped frames); absent where ``fps`` come a second.
 
@@ -148,12 +149,19 @@ class Take:
         return self.seconds - self.seconds[:1]
 
     @property
+    def numbers(self) -> Tensor:
+        """Which frame of the recording each one is, counted from 0, (T,) int64; C3D, TRC and OpenFace count from 1."""
+        numbers = self.extras.get("frame_numbers")
+        if isinstance(numbers, Tensor) and numbers.shape == (len(self),):
+            return numbers
+        return torch.arange(len(self))
+
+    @property
     def clock(self) -> Tensor:
         """When each frame is shown by its time or frame number, seconds since the recording began, (T,) float64."""
         if self.seconds is not None:
             return self.seconds
-        numbers = self.extras.get("frame_numbers")
-        return self.times + (0.0 if numbers is None or not len(numbers) else float(numbers[0]) / self.fps)
+        return self.times + float(self.numbers[:1].sum()) / self.fps
 
     @property
     def duration(self) -> float:

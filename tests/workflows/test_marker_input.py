@@ -1,5 +1,6 @@
 """Takes as they come from a recorder: prefixes, strangers, other labels, more frames than wanted."""
 
+import struct
 from dataclasses import replace
 from pathlib import Path
 
@@ -80,6 +81,26 @@ def test_frames_cut_the_take(stage: Path, capsys: pytest.CaptureFixture[str]) ->
     with pytest.raises(SystemExit):
         solved(stage, "take.c3d", "--frames", "40:70", "--neutral", "10")
     assert "--neutral: found frame 10" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("ending", [".c3d", ".trc", ".csv"])
+def test_a_trimmed_take_keeps_its_frames_numbers(ending: str, stage: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Formats count from 0 or 1: frame 70 of the recording is row 70 of the whole take's weights whichever it is."""
+    whole = solved(stage, "take.c3d")
+    save_take(load_take(stage / "take.c3d").frames(slice(70, 120)), stage / f"trimmed{ending}")
+    if ending == ".c3d":
+        assert struct.unpack_from("<H", (stage / "trimmed.c3d").read_bytes(), 6) == (71,)
+    trimmed = solved(stage, f"trimmed{ending}")
+    assert trimmed.timecode == whole.timecode[70:120]
+    some = solved(stage, f"trimmed{ending}", "--frames", "80:90", "--neutral", "85")
+    assert some.timecode == whole.timecode[80:90]
+    with pytest.raises(SystemExit):
+        solved(stage, f"trimmed{ending}", "--frames", "80:90", "--neutral", "5")
+    assert "found frame 5, expected one of those that are solved, 80 to 89" in " ".join(capsys.readouterr().err.split())
+    for text in ("0:30", "120:"):
+        with pytest.raises(SystemExit):
+            solved(stage, f"trimmed{ending}", "--frames", text)
+        assert "in a take of 50 frames, numbered 70 to 119" in " ".join(capsys.readouterr().err.split())
 
 
 def test_attach_takes_a_recorders_labels_too(stage: Path, capsys: pytest.CaptureFixture[str]) -> None:

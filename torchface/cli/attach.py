@@ -58,7 +58,8 @@ def attach(
         labels: What the take's labels are called in INITIAL, and from then on: CSV, a row LABEL OF THE TAKE,LABEL
             each; an empty second cell leaves the marker out, with Jane:* all of a subject's. Unlabelled points and
             subjects' prefixes (Actor:M001) are left out without it.
-        frames: Use the frames A:B of the take only, from A up to, not including, B; counted from 0.
+        frames: Use the frames A:B of the take only, from A up to, not including, B; counted from 0, also in a take that
+            was trimmed.
         unit: What the take's coordinates are in: um, mm, cm, m or in; else what the file says (CSV: millimetres).
         flip: Negate this axis of the take's coordinates: for takes exported in left-handed axes, which are mirrored.
         scale: Of the take against the rig: held at 1, or free, to be estimated. Held where the unit is known (C3D, TRC,

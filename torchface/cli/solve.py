@@ -72,8 +72,8 @@ def solve(
         live_link: Also write Live Link Face CSV whatever the rig's names are: halves are merged, shapes that ARKit does
             not have are left out.
         animation: Also write the rig with this animation as .glb, USD or .ma (Maya).
-        neutral: A frame with the face at rest: the take is moved onto the rig by it (rotation and translation; --scale
-            for the scale).
+        neutral: A frame with the face at rest, counted as --frames does: the take is moved onto the rig by it (rotation
+            and translation; --scale for the scale).
         align: Move the take onto the rig without a neutral frame. With neither, markers are in the rig's space.
         keep_rest: Do not subtract what is left at rest between a moved take and the rig.
         slip: The helmet moves on the head, or the head moves in the capture volume (with --align or --neutral): find
@@ -96,7 +96,8 @@ def solve(
         ridge: Quadratic pull of each weight toward zero, square millimetres.
         labels: What the take's labels are called in the attachment: CSV, a row LABEL OF THE TAKE,LABEL OF THE
             ATTACHMENT each; an empty second cell leaves the marker out, with Jane:* all of a subject's.
-        frames: Solve the frames A:B of the take only, from A up to, not including, B; counted from 0.
+        frames: Solve the frames A:B of the take only, from A up to, not including, B; counted from 0, as in OUT, also
+            in a take that was trimmed.
         unit: What the take's coordinates are in: um, mm, cm, m or in; else what the file says (CSV: millimetres).
         flip: Negate this axis of the take's coordinates: for takes exported in left-handed axes, which are mirrored.
         scale: Of the take against the rig: held at 1, or free, to be estimated. Held where the unit is known (C3D, TRC,

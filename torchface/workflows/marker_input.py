@@ -119,7 +119,7 @@ def read_range_of_motion(
 ) -> tuple[Take, Attachment | None, list[str]]:
     """The frames of a range of motion with the markers that are seen in them, the sites of these, and remarks."""
     take, notes = read_markers(path, None if initial is None else initial.labels, options)
-    take = take.frames(frame_span(options.frames, len(take)))
+    take = take.frames(frame_span(options.frames, take))
     assert take.markers is not None
     seen = (~torch.isnan(take.markers.values).any(-1)).any(0).tolist()
     labels = [name for name, shown in zip(take.markers.names, seen, strict=True) if shown]
@@ -130,17 +130,21 @@ def read_range_of_motion(
     return replace(take, markers=take.markers.select(labels)), sites, notes
 
 
-def frame_span(frames: str | None, count: int) -> slice:
-    """The rows that ``A:B`` means of a take of ``count`` frames."""
+def frame_span(frames: str | None, take: Take) -> slice:
+    """The rows of a take that ``A:B`` means by its frame numbers."""
     if frames is None:
-        return slice(0, count)
+        return slice(0, len(take))
     match = _SPAN.fullmatch(frames)
     if match is None:
         raise ValueRangeError(f"--frames: found {frames!r}, expected A:B, such as 120:900, 120: or :900")
-    first, last = int(match[1] or 0), min(int(match[2] or count), count)
-    if first >= last:
-        raise ValueRangeError(f"--frames: found {frames!r} in a take of {count} frames, expected A < B and A < {count}")
-    return slice(first, last)
+    low, high = take.numbers[[0, -1]].tolist()
+    first, last = int(match[1] or low), min(int(match[2] or high + 1), high + 1)
+    if not low <= first < last:
+        raise ValueRangeError(
+            f"--frames: found {frames!r} in a take of {len(take)} frames, numbered {low} to {high}, expected A < B and "
+            f"A from {low} to {high}"
+        )
+    return slice(*torch.searchsorted(take.numbers, torch.tensor([first, last])).tolist())
 
 
 HEADER = ("take", "attachment")

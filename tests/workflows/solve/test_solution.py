@@ -1,5 +1,6 @@
 """A take with faults solves as well as the same take without them, or the user is told."""
 
+import re
 from dataclasses import replace
 
 import pytest
@@ -217,7 +218,25 @@ def test_labels_exchanged_in_part_of_a_take_that_is_not_cleaned_are_warned_of(
     settings = SolveSettings(align=True, free_scale=False, frame_by_frame=True)
     found = solve_markers(rig, sites, exchanged(take, pair, 27, 33), settings)
     first, second = ((sites.labels or ())[m] for m in pair)
-    assert f"the labels {first} and {second} are exchanged in about 10 % of the frames" in found.warnings[0]
+    named = f"the labels {first} and {second} are exchanged in about 10 % of the frames (27–32)"
+    assert named in found.warnings[0]
+
+
+def test_a_marker_that_is_elsewhere_in_the_whole_take_is_named(stage: Capture) -> None:
+    """What is subtracted at rest would hide it in the distances."""
+    rig, sites, _ = stage
+    take, _ = recorded(stage, slips=False)
+    values = take.markers.values.clone()
+    values[:, 4] += torch.tensor([0.0, 9.0, 12.0])
+    dirty = replace(take, markers=Track(take.markers.names, values))
+    settings = SolveSettings(align=True, free_scale=False, frame_by_frame=True)
+    right, warned = (solve_markers(rig, sites, each, settings) for each in (take, dirty))
+    assert not any("lie off their sites" in text for text in right.warnings)
+    (warning,) = (text for text in warned.warnings if "lie off their sites" in text)
+    label, distance = re.search(r"sites: (\S+) (\S+) mm;", warning).groups()
+    assert label == take.markers.names[4]
+    assert float(distance) == pytest.approx(15.0, abs=4.0)
+    assert SolveReport(warned, 1.0, 1.0).verdict().startswith("result: partly usable, 1 marker lies off the site")
 
 
 def bent(rig: BlendshapeRig, size: float, seed: int) -> BlendshapeRig:
@@ -255,7 +274,8 @@ def test_a_neutral_frame_that_moves_is_warned_of_with_the_calmest_one(shape: str
     weights[40, rig.index([shape])] = level
     take, _ = recorded((rig, sites, [weights]), slips=False)
     settings = SolveSettings(free_scale=False, frame_by_frame=True)
-    calm, restless = (solve_markers(rig, sites, take, replace(settings, neutral=frame)) for frame in (20, 40))
+    cut = take.frames(slice(5, None))  # frames are named by their numbers in the recording
+    calm, restless = (solve_markers(rig, sites, cut, replace(settings, neutral=row)) for row in (15, 35))
     assert not any("not at rest" in warning for warning in calm.warnings)
     (warning,) = (warning for warning in restless.warnings if "frame 40 is not at rest" in warning)
     assert shape in warning

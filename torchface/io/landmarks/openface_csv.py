@@ -27,7 +27,7 @@ def load_landmarks_csv(path: str | Path) -> Take:
 
     A landmark ``n`` is the columns ``x_n`` and ``y_n``; a frame of ``success`` 0 was not seen: NaN. Every other column
     (gaze, pose, 3D points, action units) is in ``extras["columns"]`` by name, (T,) float64. Frame numbers other than
-    1, 2, ... are kept in ``extras["frame_numbers"]``; frames that come unevenly keep their times.
+    1, 2, ... are kept in ``extras["frame_numbers"]``, counted from 0; frames that come unevenly keep their times.
 
     Source: OpenFace wiki, "Output Format".
     """

@@ -46,8 +46,8 @@ def load_c3d(path: str | Path, unit: str | None = None) -> Take:
     A point whose residual is negative or NaN, or one of whose coordinates is no number, was not seen: NaN.
     ``POINT:X_SCREEN`` and ``Y_SCREEN`` say which of the file's axes point right and up; where they are given, the
     points are turned to y up. Labels come from ``POINT:LABELS``, ``LABELS2``, ...; empty and repeated ones are made
-    distinct (:func:`torchface.io.markers.marker_checks.unique_labels`). A first frame other than 1 is kept in
-    ``extras["frame_numbers"]``. Analog channels are skipped.
+    distinct (:func:`torchface.io.markers.marker_checks.unique_labels`). A first frame after frame 1 is kept in
+    ``extras["frame_numbers"]``, which count from 0. Analog channels are skipped.
 
     Args:
         unit: ``"mm"``, ``"cm"``, ``"m"`` or ``"in"``; else what ``POINT:UNITS`` says.
@@ -76,8 +76,8 @@ def load_c3d(path: str | Path, unit: str | None = None) -> Take:
     if axes is not None:
         positions = positions @ axes.T
     positions[np.abs(positions) > np.finfo(np.float32).max] = np.nan
-    first = _first_frame(sections)
-    extras = {} if first == 1 else {"frame_numbers": torch.arange(first, first + len(positions))}
+    first = _first_frame(sections) - 1
+    extras = {"frame_numbers": torch.arange(first, first + len(positions))} if first > 0 else {}
     return marker_take(path, FrameTimes(fps, None), _labels(sections, int(points)), positions, extras, factor)
 
 

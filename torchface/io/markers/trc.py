@@ -24,7 +24,8 @@ def load_trc(path: str | Path, unit: str | None = None) -> Take:
     """Reads a TRC file, in millimetres, float32; a marker whose cells are empty or NaN was not seen.
 
     Empty and repeated labels are made distinct (:func:`torchface.io.markers.marker_checks.unique_labels`). Frame
-    numbers other than 1, 2, ... are kept in ``extras["frame_numbers"]``; frames that come unevenly keep their times.
+    numbers other than 1, 2, ... are kept in ``extras["frame_numbers"]``, counted from 0; frames that come
+    unevenly keep their times.
 
     Args:
         path: the file, y up as OpenSim has it.

@@ -273,7 +273,8 @@ def _counted(times: np.ndarray) -> np.ndarray:
 
 
 def numbering_extras(numbers: np.ndarray, first: int, where: str) -> dict[str, Any]:
-    """What ``Take.extras`` keeps of a file's frame numbers (T,): nothing where they simply count up from ``first``."""
+    """What ``Take.extras`` keeps of a file's frame numbers (T,), which count from ``first`` or 0: nothing where they
+    simply count up from there."""
     if not np.all((numbers >= 0) & (numbers <= _MAX_FRAME_NUMBER) & (numbers == np.floor(numbers))):
         raise FileFormatError(
             f"{where}: found frame numbers that are negative or no whole numbers, expected 0, 1, 2, ..."
@@ -284,14 +285,12 @@ def numbering_extras(numbers: np.ndarray, first: int, where: str) -> dict[str, A
         raise FileFormatError(
             f"{where}: found frame {numbers[row + 1]:.0f} after frame {numbers[row]:.0f}, expected rising numbers"
         )
+    first = min(first, int(numbers[0])) if len(numbers) else first
     if len(numbers) == 0 or (numbers[0] == first and np.all(steps == 1)):
         return {}
-    return {"frame_numbers": torch.from_numpy(numbers.astype(np.int64))}
+    return {"frame_numbers": torch.from_numpy(numbers.astype(np.int64) - first)}
 
 
 def frame_numbers(take: Take, first: int) -> Sequence[int]:
-    """The numbers to write: those the take was read with, else counted up from ``first``."""
-    numbers = take.extras.get("frame_numbers")
-    if isinstance(numbers, torch.Tensor) and numbers.shape == (len(take),):
-        return numbers.tolist()
-    return range(first, first + len(take))
+    """The numbers to write in a format that counts from ``first``."""
+    return (take.numbers + first).tolist()

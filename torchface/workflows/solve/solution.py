@@ -78,7 +78,8 @@ class Solution:
     motion: HelmetMotion | None = None  # the helmet's, where it was asked for
     cleanup: Cleanup | None = None  # what was wrong with the take, where that was asked for
     warnings: tuple[str, ...] = ()  # what the user should know before they use the weights
-    exchanged: bool = False  # labels are, by a warning; what is subtracted at rest hides that in the distances
+    # What a warning says of labels or sites; what is subtracted at rest hides that in the distances.
+    misplaced: str = ""
 
     @property
     def weights(self) -> Tensor:
@@ -158,8 +159,8 @@ class SolveReport:
         if fit.noisy:
             why = "more noise than a stage's, another head's rig, or a take that needs --clean or --slip?"
             return f"result: partly usable, {lie}; {why}); {seen}"
-        if self.solution.exchanged:
-            return f"result: partly usable, labels seem to be exchanged, see the warning; {lie}); {seen}"
+        if self.solution.misplaced:
+            return f"result: partly usable, {self.solution.misplaced}, see the warning; {lie}); {seen}"
         if self.solution.stray_warnings:
             return f"result: partly usable, single frames are wrong, see the warning; {lie}); {seen}"
         if self.seen < _MOST:
@@ -233,6 +234,7 @@ def solve_markers(
     cleanup = None
     exchanged = [] if settings.clean else label_warnings(solver, take, settings.slip)
     warnings += exchanged
+    misplaced = "labels seem to be exchanged" if exchanged else ""
     if settings.clean:
         progress("looking for what is wrong with the take")
         cleanup = clean_take(solver, take, settings.slip)
@@ -251,7 +253,14 @@ def solve_markers(
     if alignment is not None:
         free = alignment if settings.free_scale else align_take(rig, attachment, steady, insist=True)
         warnings += scale_warnings(float(free.scale[0]), not settings.free_scale, take.extras.get("unit"))
-    warnings += check_head(rig, attachment, steady, settings.insist, fit.cause)
+    doubted, astray = check_head(rig, attachment, steady, settings.insist, fit.cause)
+    warnings += doubted
+    if astray:
+        misplaced = misplaced or f"{len(astray)} marker{'s lie' if len(astray) > 1 else ' lies'} off the site"
+        warnings.append(
+            f"in the whole take markers lie off their sites: {listed(astray)}; they sit elsewhere, or have others' "
+            "labels: find the sites (torchface attach), rename or leave them out (--labels)"
+        )
     if settings.subtract_rest and alignment is not None:
         attachment = rest_residual(rig, attachment, steady)
         # Sites that are nearer to the markers show the helmet's motion better.
@@ -273,7 +282,7 @@ def solve_markers(
     sites = attachment.select(labels)
     if head is not None and motion is not None and alignment is not None:
         motion = head.moved_by(alignment).after(motion)
-    solution = Solution(rig, solved, markers, sites, alignment, motion, cleanup, exchanged=bool(exchanged))
+    solution = Solution(rig, solved, markers, sites, alignment, motion, cleanup, misplaced=misplaced)
     return replace(solution, warnings=(*warnings, *solution.stray_warnings))
 
 
@@ -305,7 +314,7 @@ def _empty_frame_warnings(take: Take, held: bool = True) -> list[str]:
 
 def _frames(take: Take, rows: Tensor) -> str:
     """Rows of a take (K,) as a text: ``10 frames (120–128, 340)``."""
-    rows = take.extras.get("frame_numbers", torch.arange(len(take)))[rows.cpu()]
+    rows = take.numbers[rows.cpu()]
     breaks = (rows.diff() > 1).nonzero()[:, 0].tolist()
     firsts, lasts = [0, *(i + 1 for i in breaks)], [*breaks, len(rows) - 1]
     spans = [(int(rows[a]), int(rows[b])) for a, b in zip(firsts, lasts, strict=True)]

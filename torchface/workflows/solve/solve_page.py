@@ -134,7 +134,7 @@ def _defects(cleanup: Cleanup, fps: float) -> Section:
     tables = []
     for kind, title in _KINDS.items():
         defects = sorted((d for d in cleanup.defects if d.kind == kind), key=lambda d: -d.size)
-        rows = [_row(defect, fps) for defect in defects]
+        rows = [(*row[:1], cleanup.span(defect), *row[1:]) for defect in defects for row in [_row(defect, fps)]]
         if rows:
             tables.append(Table((title, *_HEADING[1:]), rows[:_MAX_ROWS]))
         if len(rows) > _MAX_ROWS:

@@ -5,6 +5,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.errors import ValueRangeError
@@ -56,9 +57,9 @@ def solve_take(
     attachment.check(rig.neutral, inputs.attachment, inputs.rig)
     progress("reading the take")
     take, notes = read_markers(inputs.take, attachment.labels or (), inputs.options)
-    span = frame_span(inputs.options.frames, len(take))
+    span = frame_span(inputs.options.frames, take)
     if settings.neutral is not None:
-        settings = replace(settings, neutral=_within(settings.neutral, span))
+        settings = replace(settings, neutral=_row(settings.neutral, take.numbers[span]))
     settings = replace(settings, free_scale=inputs.options.frees_scale(inputs.take))
     camera, predicted = inputs.camera, None
     if camera is not None:
@@ -86,10 +87,12 @@ def solve_take(
     return report
 
 
-def _within(frame: int, span: slice) -> int:
-    """A frame of the file as a row of what is left of it."""
-    if not span.start <= frame < span.stop:
+def _row(frame: int, numbers: Tensor) -> int:
+    """Where a frame is among those that are solved, by their numbers (T,)."""
+    row = int(torch.searchsorted(numbers, frame))
+    if row == len(numbers) or int(numbers[row]) != frame:
         raise ValueRangeError(
-            f"--neutral: found frame {frame}, expected one of those that are solved, {span.start} to {span.stop - 1}"
+            f"--neutral: found frame {frame}, expected one of those that are solved, {int(numbers[0])} to "
+            f"{int(numbers[-1])}"
         )
-    return frame - span.start
+    return row

@@ -7,12 +7,13 @@ import torch
 
 from torchface.attachment import Attachment
 from torchface.capture.markers import FitCheck, MarkerSolver, check_fit
-from torchface.capture.markers.cleaning.label_swaps import cycled_back, find_swaps, whole_take_exchanges
+from torchface.capture.markers.cleaning.label_swaps import Swap, cycled_back, find_swaps, whole_take_exchanges
 from torchface.capture.markers.cleaning.robust_prediction import predict_markers
 from torchface.capture.markers.residual_pattern import residual_pattern
-from torchface.capture.markers.rest_pose import check_not_collinear
+from torchface.capture.markers.rest_pose import check_not_collinear, inlier_markers
 from torchface.capture.markers.take_alignment import align_take, rest_residual
 from torchface.errors import AlignmentError, NameMismatchError
+from torchface.escaped_text import listed
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.rig import BlendshapeRig
 from torchface.take import Take
@@ -113,9 +114,10 @@ def fit_warnings(fit: FitCheck, aligned: bool, slip: bool) -> list[str]:
 
 def check_head(
     rig: BlendshapeRig, attachment: Attachment, take: Take, insist: bool = False, cause: str = ""
-) -> list[str]:
-    """Warnings where rig, attachment and take do not belong to one head, by the residual of the take."""
-    warnings = []
+) -> tuple[list[str], list[str]]:
+    """Warnings where rig, attachment and take do not belong to one head, by the residual of the take; and the markers
+    that lie off their sites in the whole take, which alone are no warning."""
+    warnings: list[str] = []
     distance = attachment.rest_distance(rig.neutral)
     if distance > MAX_REST_DISTANCE:
         why = (
@@ -129,19 +131,22 @@ def check_head(
     assert take.markers is not None
     few = take.markers.frames(slice(None, None, max(1, len(take) // _LABEL_FRAMES)))
     if bool(torch.isnan(few.values).any(-1).all()):
-        return warnings
+        return warnings, []
     given = attachment.residual
     residual = rest_residual(rig, attachment, Take(take.fps, markers=few)).residual
     assert residual is not None
+    residual = residual if given is None else residual - given
     faces, rest = rig.neutral.faces, rig.vertices.detach()
     normals = attachment.on(faces, vertex_normals(rest, faces))
-    pattern = residual_pattern(residual if given is None else residual - given, attachment.on(faces, rest), normals)
+    pattern = residual_pattern(residual, attachment.on(faces, rest), normals)
     if pattern.other_head and cause in ("", "attachment"):
         warnings.append(
             f"what is left at rest is smooth over the face ({pattern.smooth:.2g} mm, correlation of neighbours "
             f"{pattern.correlation:.2f}): the rig is most likely another head's; weights will be wrong"
         )
-    return warnings
+    off = residual.norm(dim=-1)
+    astray = [m for m in off.argsort(descending=True).tolist() if not bool(inlier_markers(off)[m])]
+    return warnings, [f"{(attachment.labels or ())[m]} {float(off[m]):.1f} mm" for m in astray]
 
 
 def neutral_warnings(rig: BlendshapeRig, attachment: Attachment, take: Take, frame: int, scale: bool) -> list[str]:
@@ -163,9 +168,10 @@ def neutral_warnings(rig: BlendshapeRig, attachment: Attachment, take: Take, fra
     if float(size[-1]) <= float(size[calmest]) + MAX_NEUTRAL_MOTION:
         return []
     strongest = [rig.names[i] for i in weights[-1].argsort(descending=True)[:3].tolist()]
+    number, calm = (int(take.numbers[row]) for row in (frame, rows[calmest]))
     return [
-        f"frame {frame} is not at rest: the face moves the markers by {float(size[-1]):.2g} mm there "
-        f"({', '.join(strongest)}), by {float(size[calmest]):.2g} mm in frame {int(rows[calmest])}: take that for "
+        f"frame {number} is not at rest: the face moves the markers by {float(size[-1]):.2g} mm there "
+        f"({', '.join(strongest)}), by {float(size[calmest]):.2g} mm in frame {calm}: take that for "
         "--neutral, or --align in its place"
     ]
 
@@ -173,8 +179,8 @@ def neutral_warnings(rig: BlendshapeRig, attachment: Attachment, take: Take, fra
 def label_warnings(solver: MarkerSolver, take: Take, slip: bool) -> list[str]:
     """Warnings for labels that are exchanged in the whole take or in part of it; for takes that are not cleaned."""
     assert take.markers is not None
-    few = solver.arrange(take.markers).double()
-    few = few[:: max(1, len(few) // _LABEL_FRAMES)]
+    step = max(1, len(take) // _LABEL_FRAMES)
+    few, numbers = solver.arrange(take.markers).double()[::step], take.numbers[::step].tolist()
     prediction = predict_markers(solver, few, slip)
     lines = []
     for cycle in (cycles := whole_take_exchanges(few, prediction)):
@@ -187,13 +193,15 @@ def label_warnings(solver: MarkerSolver, take: Take, slip: bool) -> list[str]:
     if cycles:
         few = cycled_back(few, cycles)
         prediction = predict_markers(solver, few, slip)
-    shares: dict[tuple[int, int], int] = {}
+    stretches: dict[tuple[int, int], list[Swap]] = {}
     for swap in find_swaps(few, prediction, 1.0):
-        shares[swap.markers] = shares.get(swap.markers, 0) + swap.last - swap.first
-    for (a, b), count in shares.items():
+        stretches.setdefault(swap.markers, []).append(swap)
+    for (a, b), swaps in stretches.items():
+        count = sum(swap.last - swap.first for swap in swaps)
+        spans = listed(f"{numbers[swap.first]}–{numbers[swap.last - 1]}" for swap in swaps)
         lines.append(
             f"the labels {solver.labels[a]} and {solver.labels[b]} are exchanged in about "
-            f"{100 * count / len(few):.0f} % of the frames: --clean exchanges them back"
+            f"{100 * count / len(few):.0f} % of the frames ({spans}): --clean exchanges them back"
         )
     return lines
 

@@ -28,7 +28,7 @@ class Defect:
     Args:
         kind: ``swap``, ``spike``, ``displaced`` (it drifts, has fallen off, or carries another's label) or ``gap``.
         labels: the markers; two for a swap, or more that changed round, each called like the next.
-        first, last: frames, ``last`` included.
+        first, last: rows of the take, ``last`` included.
         size: largest distance from where the rig expects the marker, millimetres; 0 for a gap.
         action: what was done: ``swapped back``, ``masked``, ``filled`` or ``left``.
 
@@ -71,18 +71,22 @@ class Cleanup:
     masked: Tensor
 
     def table(self, gaps: bool = True) -> list[tuple[str, ...]]:
-        """Rows for people to read, gravest kind first: kind, markers, frames, size, action."""
+        """Rows for people to read, gravest kind first: kind, markers, frames by the take's numbers, size, action."""
         return [
             (
                 defect.kind,
                 " ↔ ".join(defect.labels),
-                f"{defect.first}–{defect.last}",
+                self.span(defect),
                 f"{defect.size:.1f} mm" if defect.size else "",
                 defect.action,
             )
             for defect in sorted(self.defects, key=lambda defect: _BY_SEVERITY.index(defect.kind))
             if gaps or defect.kind != "gap"
         ]
+
+    def span(self, defect: Defect) -> str:
+        """The frames of a defect by the take's numbers, as a text."""
+        return f"{int(self.take.numbers[defect.first])}–{int(self.take.numbers[defect.last])}"
 
     def summary(self) -> str:
         """How many of each."""
