@@ -16,7 +16,7 @@ from torchface.registration import load_scan_landmarks
 from torchface.workflows.animated_meshes import load_animated
 from torchface.workflows.batch.batch_items import SCAN_ENDINGS
 from torchface.workflows.posed_mesh import load_posed
-from torchface.workflows.register.register_scans import load_template
+from torchface.workflows.register.register_scans import load_template_mesh
 
 pytestmark = pytest.mark.usefixtures("same_process")
 
@@ -69,7 +69,7 @@ def test_meshes_over_time_poses_and_templates(shot: Path, dome_rig: BlendshapeRi
     assert (moved.read(0, 6) - dome_rig(weights)).abs().max() < 1e-3
     posed = load_posed(shot, {dome_rig.names[0]: 0.5})
     assert (posed.mesh.vertices - dome_rig.vertices - 0.5 * dome_rig.deltas[0]).abs().max() < 1e-3
-    assert (load_template(shot).vertices - dome_rig.vertices).abs().max() < 1e-3
+    assert (load_template_mesh(shot).vertices - dome_rig.vertices).abs().max() < 1e-3
     assert ".usdc" in SCAN_ENDINGS
 
 

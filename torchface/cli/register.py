@@ -58,7 +58,7 @@ def register(
     from torchface.workflows.register.register_scans import (
         ScanSettings,
         load_shape_model,
-        load_template,
+        load_template_mesh,
         register_scans,
     )
 
@@ -66,7 +66,7 @@ def register(
         heads = None if model is None else load_shape_model(model)
         settings = ScanSettings(landmarks, unit, DEFAULT_SCHEDULE, texture_size, detector, heads, colors)
         done = register_scans(
-            load_template(template, part),
+            load_template_mesh(template, part),
             scans,
             out,
             settings,

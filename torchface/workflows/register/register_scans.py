@@ -27,7 +27,7 @@ _KINDS = "HeadModel or MorphableModel"
 _LARGEST_TEXTURE = 16384
 
 
-def load_template(path: Path, part: str | None = None, unit: str | None = None) -> Mesh:
+def load_template_mesh(path: Path, part: str | None = None, unit: str | None = None) -> Mesh:
     """The mesh to bend: a mesh file, or the neutral of a rig (.glb, a folder of OBJ files, ICT-FaceKit's folder)."""
     if path.is_dir():
         return load_rig(path, unit, part).neutral
