@@ -14,7 +14,7 @@ from torch import Tensor
 from torchface import Mesh, load_mesh
 from torchface.errors import FileFormatError, TopologyError, ValueRangeError
 from torchface.files.content_keys import content_key
-from torchface.files.whole_files import numbered_order
+from torchface.files.whole_files import numbered_order, visible_files
 from torchface.io import MeshSequence, MeshSequenceWriter
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.progress import Progress
@@ -90,7 +90,7 @@ def read_capture(folder: Path, neutral: Path | None) -> Capture:
     """
     if not folder.is_dir():
         raise FileFormatError(f"{folder}: found no such folder, expected one of sequences of meshes")
-    entries = sorted(entry for entry in folder.iterdir() if not entry.name.startswith("."))
+    entries = visible_files(folder)
     rest = _neutral_file(folder, entries) if neutral is None else neutral
     used = [entry for entry in entries if entry != rest]
     sequences = [

@@ -12,7 +12,7 @@ from torch import Tensor
 from torchface import BlendshapeRig, TorchfaceError, load_rig, zoo
 from torchface.errors import NameMismatchError
 from torchface.files.content_keys import content_key
-from torchface.files.whole_files import make_folder
+from torchface.files.whole_files import make_folder, visible_files
 from torchface.geometry.similarity import similarity_transform
 from torchface.modeling import ExpressionRegression, ExpressionSettings
 from torchface.progress import Progress
@@ -146,8 +146,7 @@ def entries(folder: Path) -> list[Path]:
     """An entry a person, sorted by name."""
     if not folder.is_dir():
         raise TorchfaceError(f"{folder}: found no such folder, expected one with an entry a person")
-    shown = (path for path in folder.iterdir() if path.name[0] != ".")
-    entries_found = sorted(path for path in shown if path.is_dir() or path.suffix in (".glb", ".gltf"))
+    entries_found = [path for path in visible_files(folder) if path.is_dir() or path.suffix in (".glb", ".gltf")]
     if len(entries_found) < _LEAST:
         people = "1 person" if len(entries_found) == 1 else f"{len(entries_found)} people"
         raise TorchfaceError(f"{folder}: found {people}, expected at least three: a .glb or a folder each")

@@ -10,6 +10,7 @@ from torch import Tensor
 from torchface import Attachment, BlendshapeRig, load_take
 from torchface.errors import FileFormatError, NameMismatchError, ShapeError, ValueRangeError
 from torchface.files.content_keys import content_key
+from torchface.files.whole_files import visible_files
 from torchface.progress import Progress, silent
 from torchface.shape_names import mapping
 from torchface.workflows.solve.solution import SolveSettings, solve_markers
@@ -67,8 +68,8 @@ def read_takes(
     progress = progress or silent
     if not folder.is_dir():
         raise FileFormatError(f"{folder}: found no such folder, expected one with takes")
-    inside = (*folder.glob("*"), *folder.glob("*/*"))
-    paths = sorted(path for path in inside if path.suffix.lower() in _SUFFIXES and path.is_file())
+    folders = (folder, *(one for one in visible_files(folder) if one.is_dir()))
+    paths = sorted(path for one in folders for path in visible_files(one, _SUFFIXES) if path.is_file())
     if not paths:
         raise FileFormatError(f"{folder}: found no take, expected files ending in {', '.join(_SUFFIXES)}")
     solver = content_key(_METHOD, rig=_content(rig), attachment=attachment)

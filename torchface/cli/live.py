@@ -82,6 +82,7 @@ def live(
         cameras: Only list the cameras.
     """
     from torchface.errors import FileFormatError, ValueRangeError
+    from torchface.files.whole_files import visible_files
     from torchface.workflows.live.camera_devices import check_source, list_cameras
 
     if cameras:
@@ -101,7 +102,7 @@ def live(
     if examples:
         from torchface.workflows.examples.live_examples import ExamplesSolver
 
-        files = [one for path in examples for one in (sorted(path.glob("*.json")) if path.is_dir() else [path])]
+        files = [one for path in examples for one in (visible_files(path, (".json",)) if path.is_dir() else [path])]
         if not files:
             raise FileFormatError(f"{examples[0]}: found no .json, expected what `torchface examples` wrote")
         make_solver = partial(ExamplesSolver, files, method, landmarks)

@@ -36,9 +36,11 @@ def check_there(path: Path, what: str = "file") -> None:
         raise FileFormatError(f"{path}: found no such {what}, expected an existing one{hint}")
 
 
-def visible_files(folder: Path, endings: Collection[str]) -> list[Path]:
-    """What a folder holds with one of the endings, in order of the names; not hidden files, as macOS's ``._a.obj``."""
-    return sorted(path for path in folder.iterdir() if path.suffix.lower() in endings and path.name[0] != ".")
+def visible_files(folder: Path, endings: Collection[str] | None = None) -> list[Path]:
+    """What a folder holds, with one of the endings where some are given, in order of the names; not what is hidden, as
+    macOS's ``._a.obj`` and Jupyter's ``.ipynb_checkpoints``."""
+    shown = (path for path in folder.iterdir() if path.name[0] != ".")
+    return sorted(path for path in shown if endings is None or path.suffix.lower() in endings)
 
 
 def numbered_order(path: Path) -> list[tuple[int, int, str]]:

@@ -12,7 +12,7 @@ from torchface.attachment import Attachment
 from torchface.errors import FileFormatError
 from torchface.escaped_text import listed
 from torchface.files.models import DESCRIPTION
-from torchface.files.whole_files import check_there, read_file
+from torchface.files.whole_files import check_there, read_file, visible_files
 from torchface.geometry.cameras.calibration import CameraCalibration
 from torchface.geometry.meshes.deformation import degenerate_triangles
 from torchface.io import (
@@ -167,8 +167,8 @@ def _check_rig_folder(folder: Path) -> None:
             f"{folder}: found a learned model, expected a rig; `torchface zoo describe "
             f"{quote(str(folder))}` shows what is known of it"
         )
-    scenes = [path.name for path in sorted(folder.iterdir()) if path.suffix.lower() in SCENE_ENDINGS]
-    if scenes and sum(path.suffix.lower() == ".obj" for path in folder.iterdir()) < 2:
+    scenes = [path.name for path in visible_files(folder, SCENE_ENDINGS)]
+    if scenes and len(visible_files(folder, (".obj",))) < 2:
         raise FileFormatError(
             f"{folder}: found a folder with {_named(scenes)}, expected a file, such as {folder / scenes[0]}, or a "
             "folder of OBJ files, a neutral and one for each shape"

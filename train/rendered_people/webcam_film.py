@@ -14,7 +14,7 @@ from torch import Tensor
 
 from torchface.errors import ValueRangeError
 from torchface.files.content_keys import content_key
-from torchface.files.whole_files import make_folder, write_file
+from torchface.files.whole_files import make_folder, visible_files, write_file
 from torchface.io import load_ict_facekit, load_identity_modes, load_take
 from torchface.io.video import open_video, write_video
 from torchface.progress import Progress
@@ -112,7 +112,7 @@ def _weights(scene: Scene, takes: Path | None) -> Tensor:
         count = round((scene.start + scene.length) * FPS)
         take = converse(count, torch.Generator().manual_seed(scene.take), FPS)
     else:
-        paths = sorted(takes.glob("*.csv"))
+        paths = visible_files(takes, (".csv",))
         if scene.take >= len(paths):
             raise ValueRangeError(f"{takes}: found {len(paths)} takes (.csv), expected {scene.take + 1} at least")
         take = load_take(paths[scene.take])

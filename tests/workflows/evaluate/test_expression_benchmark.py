@@ -34,6 +34,8 @@ def folders(tmp_path: Path) -> tuple[Path, Path]:
         save(halved, results / "half" / f"{film}.csv")
         if film == "a":
             save(true, results / "perfect" / film / "live_link.csv")
+            save(true, results / ".ipynb_checkpoints" / "a.csv")  # neither a method nor a film
+            (films / "._a.csv").write_bytes(b"\0\5\x16\7")
     return results, films
 
 

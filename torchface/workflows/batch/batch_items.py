@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, overload
 
 from torchface.errors import FileFormatError, ValueRangeError
+from torchface.files.whole_files import visible_files
 from torchface.io.mesh_files import MESH_ENDINGS
 from torchface.io.rig_files import SCENE_ENDINGS
 from torchface.io.take_files import MARKER_ENDINGS
@@ -110,7 +111,7 @@ def find_items(inputs: Sequence[str | Path], kind: ItemKind) -> FoundItems:
         if not given.is_dir() or kind.holds(given):
             files[given.resolve()] = None
             continue
-        visible = [path for path in sorted(given.iterdir()) if path.name[0] != "." and path.name not in _OWN]
+        visible = [path for path in visible_files(given) if path.name not in _OWN]
         inside = [path for path in visible if kind.holds(path)]
         others = _others([path for path in visible if path not in set(inside)], inside, kind)
         expected = f"expected {kind.noun}s ({', '.join(kind.endings)})"

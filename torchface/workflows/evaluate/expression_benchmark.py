@@ -11,7 +11,7 @@ from torch import Tensor
 from torchface.errors import ShapeError, ValueRangeError
 from torchface.evaluation.expression_scores import MethodScore, expression_score
 from torchface.files.job_lock import within_job
-from torchface.files.whole_files import all_or_none
+from torchface.files.whole_files import all_or_none, visible_files
 from torchface.io import load_take
 from torchface.io.tables.csv_table import write_table
 from torchface.progress import Progress, silent
@@ -90,11 +90,11 @@ def expression_benchmark(
     """
     progress = progress or silent
     with within_job(out):
-        truths = {path.stem: _arkit(path) for path in sorted(films.glob("*.csv"))}
+        truths = {path.stem: _arkit(path) for path in visible_files(films, (".csv",))}
         if not truths:
             raise ValueRangeError(f"{films}: found no .csv, expected the true weights of films")
         folders = {results.name: results} if _results(results, truths) else {
-            path.name: path for path in sorted(results.iterdir()) if path.is_dir() and _results(path, truths)
+            path.name: path for path in visible_files(results) if path.is_dir() and _results(path, truths)
         }  # fmt: skip
         if not folders:
             raise ValueRangeError(

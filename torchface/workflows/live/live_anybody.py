@@ -20,6 +20,7 @@ from torchface.capture.anybody.skin_follower import SkinFollower
 from torchface.capture.anybody.webcam_state import StateLayout
 from torchface.errors import TorchfaceError, ValueRangeError
 from torchface.files.job_lock import job_lock
+from torchface.files.whole_files import visible_files
 from torchface.io import load_take
 from torchface.io.protocols.stream_address import is_source, parse_source
 from torchface.io.protocols.weight_sender import find_receiver
@@ -272,11 +273,8 @@ def _keep_dropped(preparing: Preparing, recordings: Recordings, say: Say) -> Non
 def import_recordings(folder: Path, recordings: Recordings, say: Say) -> None:
     """Makes takes of the recordings that lie in a folder as files, such as a phone's, once each."""
     known = {take.name for take in kept_takes(folder)}
-    for path in sorted(folder.glob("*")):
-        if path.suffix.lower() in (".csv", *RECORDING_ENDINGS) and printable(path.name) not in (
-            *(WEIGHTS, LIVE_LINK, SUMMARY),
-            *known,
-        ):
+    for path in visible_files(folder, (".csv", *RECORDING_ENDINGS)):
+        if printable(path.name) not in (WEIGHTS, LIVE_LINK, SUMMARY, *known):
             try:
                 recordings.keep(path.name, take_rows(load_take(path)).float())
             except TorchfaceError as error:
