@@ -8,6 +8,7 @@ import numpy as np
 
 from torchface.capture.own_rig.eye_geometry import arkit_names
 from torchface.capture.own_rig.flat_face import FlatFace, softened
+from torchface.optim.blas_threads import one_blas_thread
 
 LEAST_ERROR = 0.3
 """Of a flow, millimetres."""
@@ -90,12 +91,13 @@ class SkinFlow:
         millimetres both. ``expected`` is the change that nothing seen leaves, (M,)."""
         robust, count = np.ones_like(flow), len(self.shapes)
         pull = np.pad(self.prior[:count] * expected, (0, len(self.prior) - count))
-        for _ in range(_REWEIGHTINGS):
-            weighted = self.moves * (counts * robust * (_THIN / _TOGETHER / error) ** 2).astype(np.float32)
-            H = (weighted @ self.moves.T).astype(np.float64) + np.diag(self.prior)
-            solution = np.linalg.solve(H, weighted @ flow + pull)
-            left = flow - solution.astype(np.float32) @ self.moves
-            robust = 1 / (1 + (left / (2 * error)) ** 2)
+        with one_blas_thread():
+            for _ in range(_REWEIGHTINGS):
+                weighted = self.moves * (counts * robust * (_THIN / _TOGETHER / error) ** 2).astype(np.float32)
+                H = (weighted @ self.moves.T).astype(np.float64) + np.diag(self.prior)
+                solution = np.linalg.solve(H, weighted @ flow + pull)
+                left = flow - solution.astype(np.float32) @ self.moves
+                robust = 1 / (1 + (left / (2 * error)) ** 2)
         share = counts * robust
         remains = float(np.sqrt((share * left**2).sum() / max(float(share.sum()), 1e-9)))
         return solution[:count], np.sqrt(np.diag(np.linalg.inv(H)))[:count], remains
