@@ -47,11 +47,11 @@ def test_a_first_frame_that_is_not_at_rest_is_named_with_one_that_is(actor: Acto
     assert "warning" not in said[0]
 
 
-@pytest.mark.parametrize("other", [False, True])
-def test_a_vertex_that_is_astray_in_one_frame_is_named(actor: Actor, tmp_path: Path, other: bool) -> None:
+@pytest.mark.parametrize(("other", "way"), [(False, 866.0), (True, 866.0), (False, 30.0)])
+def test_a_vertex_that_is_astray_in_one_frame_is_named(actor: Actor, tmp_path: Path, other: bool, way: float) -> None:
     order, faces = shuffled(actor)
     frames = actor.frames.clone()
-    frames[7, order[300], 1] += 866.0
+    frames[7, order[300], 1] += way
     pairs = tmp_path / "pairs.csv"
     pairs.write_text("\n".join(["input,model", *(f"{i},{order[i]}" for i in range(0, len(order), 9))]))
     path = tmp_path / "astray.safetensors"
@@ -61,7 +61,7 @@ def test_a_vertex_that_is_astray_in_one_frame_is_named(actor: Actor, tmp_path: P
         found = coarse(actor, written(path, frames, actor.mesh.faces), tmp_path)
     assert torch.isfinite(found.read(0, 7)).all()
     vertex = 300 if other else int(order[300])
-    with pytest.raises(ValueRangeError, match=rf"vertex {vertex} in frame 7 86\d mm farther .* \(1 of {len(order)}"):
+    with pytest.raises(ValueRangeError, match=rf"vertex {vertex} in frame 7 \d+ mm farther .* \(1 of {len(order)}"):
         found.read(4, FRAMES)
 
 

@@ -249,15 +249,32 @@ def test_a_photograph_that_form_and_colours_call_another_persons_is_refused_besi
 ) -> None:
     # The form of the first speaks for it, so that its colours, which are the least likely, do not refuse it.
     form, colors = torch.tensor([0.5, -0.5, 3.0]).double(), torch.tensor([-6.0, -4.0, 0.0]).double()
-    monkeypatch.setattr(fit_checks, "same_person", lambda _: form)
-    monkeypatch.setattr(fit_checks, "color_evidence", lambda _: colors)
-    fit = SimpleNamespace(errors=torch.ones(1), landmarks=torch.rand(1, 68, 2))
-    names, marks = [Path(f"{i}.png") for i in range(3)], torch.rand(3, 68, 2)
+    monkeypatch.setattr(fit_checks, "same_person", lambda fits: form[[one.row for one in fits]])
+    monkeypatch.setattr(fit_checks, "color_evidence", lambda rows: colors[rows[:, 0].long()])
+    fits = [SimpleNamespace(errors=torch.ones(1), landmarks=torch.rand(1, 68, 2), row=row) for row in range(3)]
+    names, marks, shown = [Path(f"{i}.png") for i in range(3)], torch.rand(3, 68, 2), torch.arange(3.0)[:, None]
 
     def lines(insist: bool) -> list[str]:
-        return one_person_lines(names, marks, [fit] * 3, lambda *_: fit, insist, colors=torch.zeros(3, 4))
+        return one_person_lines(names, marks, fits, lambda *_: fits[0], insist, colors=shown)
 
-    with pytest.raises(AlignmentError, match=r"^1\.png: shows another person"):
+    found = r"^1\.png: shows another person .*; the others, 0\.png, 2\.png, may show different people, too \("
+    with pytest.raises(AlignmentError, match=found):
         lines(False)
     (line,) = lines(True)
     assert "may show different people" in line
+
+
+def test_all_photographs_that_show_others_are_named() -> None:
+    """Two of one person, and two other people: each is looked for beside what is left."""
+    eye, ways = torch.eye(4, dtype=torch.float64), torch.tensor([[0, 0], [0, 0.1], [3, -3], [-4, 4]]).double()
+    fits = [
+        SimpleNamespace(
+            coefficients=torch.cat([way, 1 - way]), covariance=0.02 * eye, errors=torch.ones(1),
+            landmarks=torch.rand(1, 68, 2),
+        )
+        for way in ways
+    ]  # fmt: skip
+    names, marks = [Path(f"{i}.png") for i in range(4)], torch.rand(4, 68, 2)
+    with pytest.raises(AlignmentError, match=r"^2\.png, 3\.png: show other people than the rest, .*; leave them out"):
+        one_person_lines(names, marks, fits, lambda *_: fits[0])
+    assert one_person_lines(names[:2], marks[:2], fits[:2], lambda *_: fits[0]) == []

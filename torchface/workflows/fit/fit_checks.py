@@ -100,10 +100,8 @@ def one_person_lines(
     Each is fitted alone too; colours (I,4) are those of ``part_colors``."""
     if len(photographs) < 2:
         return []
-    form = same_person(alone)
-    sure = form.sigmoid()
-    both = sure if colors is None else (form.clamp(max=FORM_SAYS) + color_evidence(colors)).sigmoid()
-    if float(both.min()) >= ONE_PERSON and float(sure.min()) >= DOUBTED:
+    sure, both = _likely(alone, colors)
+    if not _doubtful(sure, both):
         return []
     joint = float(misfits(bare(marks, list(range(len(marks))))).square().mean().sqrt())
     each = float(torch.stack([misfits(fit)[0] for fit in alone]).square().mean().sqrt())
@@ -117,14 +115,34 @@ def one_person_lines(
         f"above {ONE_PERSON:.0%}; landmarks lie {joint:.1%} of the eyes' distance from one head "
         f"for all, {each:.1%} from a head for each"
     )
-    others = (both < OTHERS) & (form < 0)
-    if bool(others.any()) and not insist:
-        worst = int(both.where(others, torch.inf).argmin())
+    strangers, left, more = list[int](), list(range(len(photographs))), ""
+    while len(left) > 1 and bool((others := (both < OTHERS) & (sure < 0.5)).any()):  # without the worst, the next one
+        strangers.append(left.pop(int(both.where(others, torch.inf).argmin())))
+        sure, both = _likely([alone[i] for i in left], None if colors is None else colors[left])
+    if strangers and not insist:
+        names = [", ".join(photographs[i].name for i in some) for some in (strangers, left)]
+        one = len(strangers) == 1
+        if len(left) > 1 and _doubtful(sure, both):
+            more = f"; the others, {names[1]}, may show different people, too"
         raise AlignmentError(
-            f"{photographs[worst].name}: shows another person than the rest, or its landmarks are wrong ({figures}); "
-            "leave it out, or --insist to fit them anyway"
+            f"{names[0]}: {'shows another person' if one else 'show other people'} than the rest, or "
+            f"{'its' if one else 'their'} landmarks are wrong{more} ({figures}); leave {'it' if one else 'them'} out, "
+            "or --insist to fit them anyway"
         )
     return [f"WARNING: these photographs may show different people; their mean would be nobody ({figures})"]
+
+
+def _likely(alone: Sequence[ImageFit], colors: Tensor | None) -> tuple[Tensor, Tensor]:
+    """Probabilities (I,) that each shows the person of the others, by the form alone and with the colours (I,4)."""
+    if len(alone) < 2:
+        return torch.ones(len(alone)), torch.ones(len(alone))
+    form = same_person(alone)
+    both = form if colors is None else form.clamp(max=FORM_SAYS) + color_evidence(colors)
+    return form.sigmoid(), both.sigmoid()
+
+
+def _doubtful(sure: Tensor, both: Tensor) -> bool:
+    return float(both.min()) < ONE_PERSON or float(sure.min()) < DOUBTED
 
 
 def landmark_lines(
