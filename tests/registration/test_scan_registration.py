@@ -1,6 +1,7 @@
 """A template bent onto scans whose true correspondence is known."""
 
 import math
+import re
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -54,6 +55,20 @@ def registered(mask: Mesh, scan: Mesh, landmarks: Landmarks) -> Registration:
 @pytest.fixture(scope="module")
 def by_shape(mask: Mesh, scan: Mesh) -> Registration:
     return register(mask, scan)
+
+
+@pytest.mark.parametrize("way", [(0.0, 0.0, 0.0), (0.0, 12.0, 0.0), (12.0, 0.0, 0.0)])
+def test_landmarks_that_are_all_moved_alike_are_warned_of(way: tuple[float, ...]) -> None:
+    """The mesh slides along the skin to where they are, and lies as near to the scan as without."""
+    template = neutral_head(texture=False)
+    somebody = neutral_head(draw_identities(1, torch.Generator().manual_seed(0))[0], texture=False)
+    marks = (template.landmarks, somebody.vertices[somebody.landmarks] + torch.tensor(way))
+    notes = register(template, somebody, marks, schedule=Schedule(DEFAULT_SCHEDULE.stages[:1])).record.notes
+    said = [note for note in notes if "moved alike" in note]
+    assert len(said) == bool(sum(way))
+    for note in said:
+        found = torch.tensor([float(part) for part in re.findall(r"-?[0-9]+", note.partition("about")[2])[:3]])
+        assert float((found - torch.tensor(way)).norm()) < 3
 
 
 def test_a_mesh_registered_to_itself_is_itself(mask: Mesh) -> None:

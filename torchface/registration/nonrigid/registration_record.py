@@ -5,8 +5,8 @@ from dataclasses import dataclass, field
 
 # What is usual: heads of other people, noise of 1.5 mm and holes included, come to a 95th percentile of 0.8 mm and a
 # stretch of 30 %; a head made half as high again stretches by 52 %, a box by 129 %. Landmarks that
-# err at random by 1.5, 3 and 8 mm an axis end 1.9, 3.1 and 8.2 mm beside their vertices; that all are moved alike by
-# 12 mm no figure shows.
+# err at random by 1.5, 3 and 8 mm an axis end 1.9, 3.1 and 8.2 mm beside their vertices; that all are moved alike shows
+# at the start alone (`scan_start`).
 _FAR, _STRETCHED, _TORN, _SLID = 1.0, 0.45, 0.8, 4.0
 
 
