@@ -145,6 +145,13 @@ def test_photographs_of_other_skin_move_nothing(shot: Taken) -> None:
     other = taken(person(8))
     mixed = replace(shot, images=[shot.images[0], other.images[1], shot.images[2].flip(1)])
     assert agreed_skin(wrong_head(shot, bent(shot.head)), pieces(mixed), marks(shot)) is None
+    two = Taken(shot.head, [shot.cameras[0], other.cameras[1]], [shot.images[0], other.images[1]])
+    seen = torch.stack([shot.landmarks[0], other.landmarks[1]])
+    between = shot.head.with_vertices((shot.head.vertices + other.head.vertices) / 2)
+    cut = [FacePiece.around(image, at) for image, at in zip(two.images, seen, strict=True)]
+    held = HeldMarks(shot.head.landmarks[17:], seen[:, 17:], 2.0)
+    head = ShownHead([between] * 2, two.cameras, torch.zeros(0, *between.vertices.shape))
+    assert agreed_skin(head, cut, held) is None
 
 
 def test_photographs_from_one_angle_or_of_other_expressions_are_not_compared(shot: Taken) -> None:
