@@ -15,7 +15,7 @@ from torchface.io.gltf.part_textures.iris_texture import painted_eye
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.landmarks.images.networks.part_network import PARTS
 from torchface.mesh import Mesh
-from torchface.modeling.photographs.eye_color import iris_color, with_iris
+from torchface.modeling.photographs.eye_color import iris_color, white_brightness, with_iris
 from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.image_texture import (
     _spectacles,
@@ -67,7 +67,16 @@ def test_irises_come_back_from_a_picture(bare: Mesh, planted: Tensor) -> None:
     sepia = (picture.mean(0) * torch.tensor([1.0, 0.75, 0.4])[:, None, None]).clamp(max=1)
     three = iris_color([bare] * 3, [picture, sepia, picture], [camera] * 3, centres)
     assert torch.equal(three, ringed)  # one in sepia does not decide
+    violet = torch.tensor([1.0, 0.5, 1.5])[:, None, None] * picture
+    dark, bright = (iris_color(bare, [share * violet], [camera], centres[:1]) for share in (0.35, 1.5))
+    assert bright is None  # as a flashed pupil
+    assert bool((dark[:-1] > dark[1:]).all())  # brown
+    assert abs(float(dark.mean() - (0.35 * planted * torch.tensor([1.0, 0.5, 1.5])).mean())) < 0.02
+    whites = torch.stack([torch.tensor(white_brightness(bare, [share * picture], [camera], centres[:1]))
+                          for share in (0.5, 0.6, 0.8, 1.0)])  # fmt: skip
+    torch.testing.assert_close(whites, torch.tensor([0.6, 0.66, 0.88, 1.0]), atol=0.03, rtol=0)
     far = look_at(eyes, 10.0, span=2000.0, width=320, height=200)
+    assert white_brightness(bare, [0.5 * picture], [far], centres[:1]) == 1  # as the material has them
     assert iris_color(bare, [render(worn, far, lighting=EVEN, samples=1)], [far]) is None
 
 
@@ -100,7 +109,7 @@ def test_painted_irises_take_a_colour_and_nothing_else_does() -> None:
 def test_the_edge_of_a_painted_pupil_is_soft(bare: Mesh) -> None:
     texels = rasterise_uvs(bare.uvs, bare.uv_faces, 1024, 1024)
     blank = PhotoTexture(torch.ones(3, 1024, 1024), bare.colors, torch.ones(len(bare.vertices)), texels)
-    drawn = _with_parts(blank, bare.colors, bare, part_vertices(bare), torch.ones(3)).image.mean(0)
+    drawn = _with_parts(blank, bare.colors, bare, part_vertices(bare), torch.ones(2, 3)).image.mean(0)
     assert int((drawn < 0.05).sum()) > 20
     assert int(((drawn > 0.06) & (drawn < 0.2)).sum()) > 10  # none where black ends at the next texel
 

@@ -11,7 +11,7 @@ from torchface.geometry.meshes.vertex_graph import VertexGraph
 from torchface.landmarks.images.networks.part_finder import FaceParts
 from torchface.mesh import Mesh
 from torchface.modeling.morphable.morphable_model import MorphableModel
-from torchface.modeling.photographs.eye_color import IRIS_WIDTH, iris_color
+from torchface.modeling.photographs.eye_color import IRIS_WIDTH, iris_color, white_brightness
 from torchface.modeling.photographs.fit_settings import FitSettings
 from torchface.modeling.photographs.hair_cap import HairCap, hair_cap
 from torchface.modeling.photographs.landmark_view import LANDMARKS
@@ -103,9 +103,7 @@ def photographed_skin(
         With texture coordinates: the photographs projected onto the head, their light divided out; where none shows it
         the colour model, else the template's skin; hair as a cap. Without: the colour model's colours.
     """
-    size, parts, irises, paint_hair = (
-        settings.texture_size, settings.parts, settings.irises, settings.paint_hair
-    )  # fmt: skip
+    size, parts, irises = settings.texture_size, settings.parts, settings.irises
     if parts is not None:
         images = [exposed(image, shown) for image, shown in zip(images, parts, strict=True)]
     fit = None if color is None else fit_colors(color, posed, images, cameras)
@@ -154,7 +152,7 @@ def photographed_skin(
     if parts is not None and patches is not None:
         glasses = [one.at(at, "glasses") for one, at in zip(parts, pixels, strict=True)]
         texture = _without_sharp_shadows(texture, views, mesh, graph, others, _spectacles(views, glasses))
-    if cap is not None and paint_hair:
+    if cap is not None and settings.paint_hair:
         texture = _capped(texture, cap, mesh, others)
     colors = texture.colors
     iris = iris_color(posed, images, cameras, irises) if _has_landmarks(mesh) else None
@@ -162,7 +160,9 @@ def photographed_skin(
         rest, painted = rest or mesh, torch.tensor(IRIS.color) if iris is None else iris
         colored = with_part_colors(replace(rest, colors=colors), painted)
         colors = colors if colored.colors is None else colored.colors
-        texture = _with_parts(texture, colors, rest, others, painted) if own else texture
+        if own:
+            white = white_brightness(posed, images, cameras, irises) * torch.tensor(EYEBALL.color)
+            texture = _with_parts(texture, colors, rest, others, torch.stack([painted, white]))
     of_hair, fringe = (None, False) if cap is None else (cap.color, cap.fringe)
     return Skin(colors, texture.image, fit, of_hair, iris, fringe)
 
@@ -328,9 +328,10 @@ def _capped(texture: PhotoTexture, cap: HairCap, mesh: Mesh, parts: Tensor) -> P
     return replace(texture, image=texture.texels.image(painted), colors=colors.float())
 
 
-def _with_parts(texture: PhotoTexture, colors: Tensor, mesh: Mesh, parts: Tensor, iris: Tensor) -> PhotoTexture:
-    """A texture that shows parts (V,) that are no skin in their colours (V,3), and eyeballs with an iris (3,) and a
-    pupil."""
+def _with_parts(texture: PhotoTexture, colors: Tensor, mesh: Mesh, parts: Tensor, eyes: Tensor) -> PhotoTexture:
+    """A texture that shows parts (V,) that are no skin in their colours (V,3), and eyeballs with an iris and a white
+    (2,3) and a pupil."""
+    iris, white = eyes.double()
     texels, faces = texture.texels, mesh.faces.cpu()
     corners = faces[texels.triangles]
     painted = texels.interpolate(colors.double(), faces)
@@ -339,8 +340,8 @@ def _with_parts(texture: PhotoTexture, colors: Tensor, mesh: Mesh, parts: Tensor
             ball = mesh.vertices[mask].detach().cpu().double()
             at = texels.interpolate(mesh.vertices.detach().cpu().double() - (ball.amin(0) + ball.amax(0)) / 2, faces)
             aside = torch.where(at[:, 2] > 0, at[:, :2].norm(dim=1) / (0.5 * IRIS_WIDTH), torch.inf)[:, None]
-            ringed = iris.double() * (1.1 - 0.5 * (aside.clamp(max=1) - 0.75).clamp(min=0) / 0.25)  # a dark rim
-            white, black = painted.new_tensor(EYEBALL.color), torch.full_like(ringed, 0.04)
+            ringed = iris * (1.1 - 0.5 * (aside.clamp(max=1) - 0.75).clamp(min=0) / 0.25)  # a dark rim
+            black = torch.full_like(ringed, 0.04)
             beyond, outside = (ramp(aside, edge - _SOFT / 2, edge + _SOFT / 2) for edge in (_PUPIL, 1.0))
             eye = torch.lerp(torch.lerp(black, ringed, beyond), white, outside)
             if _has_landmarks(mesh):
