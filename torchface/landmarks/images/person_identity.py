@@ -61,7 +61,7 @@ def look_alone(identity: Tensor) -> Tensor:
 def is_beside(identity: Tensor) -> Tensor:
     """Whether somebody else is so near that they may be in the way in the next moment; () bool."""
     own, other = _motions(identity)
-    return _is_known(identity) & (_apart(own, _expected(other, 1)) < _NEAR)
+    return _is_known(identity) & (_apart(own, _expected(other, 1)) < _NEAR + _QUICK * other[5])
 
 
 def is_awaited(identity: Tensor) -> Tensor:
@@ -113,12 +113,14 @@ def is_other(identity: Tensor, place: Tensor, look: Tensor, interval: Tensor) ->
     elsewhere = counted_beside(identity).sum() > _ELSEWHERE
     nearer = nearer & ~(hidden & same & elsewhere)
     # Who looks otherwise is somebody else, if one is known or was seen where the first one was not; else the first one
-    # has turned, or the light is another.
+    # has turned, or the light is another. Who comes up elsewhere while the first one is hidden must look the same.
     somebody = _is_known(identity) | ((own[2] > 0) & elsewhere)
     # Who is where the first one was, while the other is seen elsewhere, is the first one, turned.
     seen_now = _is_known(identity) & (other[5] <= 0.5 * interval)
     back = seen_now & (_apart(other, place[:2]) > _AROUND) & (_apart(own, place[:2]) < _BEFORE)
-    theirs = (_is_known(identity) & nearer) | (somebody & hidden & (likeness < _STRANGE) & ~back)
+    away = is_beside(identity) & (_apart(own, place[:2]) > _BEFORE)
+    strange = likeness < torch.where(away, SAME, _STRANGE)
+    theirs = (_is_known(identity) & nearer) | (somebody & hidden & strange & ~back)
     return theirs & (from_own > torch.where(hidden, 0.0, _SURE)) & (own[5] < _FORGOTTEN)
 
 
@@ -141,7 +143,7 @@ def after_face(identity: Tensor, place: Tensor, look: Tensor, whose: tuple[Tenso
     strange = _likeness(identity, look) < _STRANGE
     mistaken = (other[5] <= 0) & strange & ((other[2] <= 0) | (_apart(other, place[:2]) < _AROUND))
     within = _distance(other, place, 1) < _REACH + _QUICK * other[5]
-    reached = (other[5] > 0) & (within | ~strange)  # half a face that comes out looks like nobody
+    reached = (other[5] > 0) & within
     passing = torch.cat([own, _moved(torch.where(mistaken, 0.0, other), place[:3], interval), identity[2 * _MOTION :]])
     return torch.where(seen, followed, torch.where(stranger & (reached | mistaken), passing, identity))
 

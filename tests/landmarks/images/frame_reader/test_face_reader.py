@@ -283,6 +283,19 @@ def test_one_of_two_boxes_that_overlap_is_not_mistaken_for_good() -> None:
     assert (away[-20:].abs() < 2).all()
 
 
+def test_who_goes_aside_while_another_passes_is_found_there(webcam: Webcam) -> None:
+    """The other stops where the first one was: that place was watched for seconds."""
+    crossing, tracker = crossing_film(after=25), quick_tracker()
+    aside = (torch.arange(len(crossing.frames)) - 24).clamp(0, 11) * 10
+    away = torch.zeros(2, len(aside))
+    for i, (frame, moved) in enumerate(zip(crossing.frames, aside.tolist(), strict=True)):
+        for row, reader in enumerate((webcam, tracker)):
+            away[row, i] = column(reader.step(frame.roll(moved, 2))) - float(crossing.columns[i]) - moved
+    assert (away[:, :15].abs() < 2).all()
+    assert (away.abs().nan_to_num(0.0) < 16).all()
+    assert (away[:, -10:].abs() < 2).all()
+
+
 def test_who_stays_before_another_is_followed_in_the_end(webcam: Webcam) -> None:
     frames = crossing_film(stays=10.0, after=0, fps=10).frames
     seen = [column(webcam.step(frame, 0.1)) for frame in frames]

@@ -132,7 +132,7 @@ class FaceReader(nn.Module):
         followed = known & ~late
         crowded = is_beside(people) & ~away
         hidden = crowded & is_awaited(people)
-        waiting = hidden | (~crowded & ~away & (missing < _PATIENCE))
+        waiting = ~crowded & ~away & (missing < _PATIENCE)
         doubted = followed & (doubt >= _DOUBT)
         lost_now = ~followed & ((missing <= _EAGER) | (since >= _PAUSE) | hidden)
         pause = torch.where(covered > 0.5, _COVERED, _COUNTED)
@@ -186,7 +186,8 @@ class FaceReader(nn.Module):
         kept = ((presence >= settings.likely) & ~vague) | ~asked | confirmed
         kept = kept & (presence >= settings.least) & (growth > _SHRUNK) & (growth < _GROWN)
         seen_well = looked.visibility.sum() >= LEAST_VISIBLE
-        good = (followed & kept) | (~followed & ~vague & seen_well & (presence >= settings.new))
+        is_face = ~vague & seen_well & (presence >= settings.new)
+        good = (followed & kept) | (~followed & is_face)
         good = good & ready & ~stranger & plausible(own, size, settings.smallest)
         empty = looked.visibility.mean() < _EMPTY
         clear = ((presence >= settings.sure) & ~vague) | confirmed
@@ -201,7 +202,7 @@ class FaceReader(nn.Module):
         ]
         anchor = torch.where(good & ~followed, relation(own, shown), anchor)
         people = torch.where(good, expected, people)
-        people = after_face(people, own, appearance, (good, stranger & (followed | there)), interval)
+        people = after_face(people, own, appearance, (good, stranger & ready & is_face), interval)
         own = torch.where(good, own, place)
         pictures = [picture.flatten(), torch.where(good, picture, showing).flatten()]
         changes = torch.stack([change, (away & ~good).float()])

@@ -260,16 +260,13 @@ class LandmarkTracker:
 
     def _chosen(self, frame: Tensor, faces: FaceBoxes) -> FaceReading | None:
         """The one of these faces that is meant, if it is one."""
-        near = self._followed.near(faces.boxes)
-        if near:
-            found = (self._face_in(frame, faces, number) for number in near)
-            own = next((face for face in found if face is not None and self._is_person(frame, face)), None)
-            if own is not None or not self._followed.cut:
-                return own
+        near = (self._face_in(frame, faces, number) for number in self._followed.near(faces.boxes))
+        own = next((face for face in near if face is not None and self._is_person(frame, face)), None)
+        if own is not None:
+            return own
         known, waits = known_look(self._followed.people), self._waits()
-        hidden = waits and not self._followed.cut and bool(is_beside(self._followed.people))
         skipped = 0 if known.any() else self.face  # who is known is chosen by the look
-        if hidden or skipped >= len(faces):
+        if skipped >= len(faces):
             return None
         shown = self._shown(frame, faces)
         if known.any():
@@ -289,7 +286,8 @@ class LandmarkTracker:
 
     def _came(self, frame: Tensor, face: FaceReading, likeness: float) -> bool:
         """Whether a face elsewhere came with a cut, or looks like the one that is missed and was not there before."""
-        return (self._followed.cut or likeness >= SAME) and self._followed.is_new(face.box, frame.shape)
+        own = self._followed.cut or (likeness >= SAME and self._is_person(frame, face))
+        return own and self._followed.is_new(face.box, frame.shape)
 
     def _still_there(self, frame: Tensor, place: Tensor) -> FaceReading | None:
         """The face where it was lost (5,), though the detector sees none: turned or half hidden."""
