@@ -25,7 +25,8 @@ def page(dome_rig: BlendshapeRig, tmp_path_factory: pytest.TempPathFactory) -> P
     values = recording.take.markers.values.clone()
     values[50:70, [3, 20]] = values[50:70, [20, 3]]
     values[90, 5] += 15
-    take = Take(60.0, markers=Track(recording.take.markers.names, values))
+    recorded = {"frame_numbers": torch.arange(480, 600)}
+    take = Take(60.0, markers=Track(recording.take.markers.names, values), extras=recorded)
     points = true.on(dome_rig.neutral.faces, dome_rig.vertices)
     points[7, 0] += 4
     found = SurfaceIndex(dome_rig.vertices, dome_rig.neutral.faces).nearest(points)
@@ -63,7 +64,9 @@ def test_the_worst_marker_comes_first_with_its_constant_part(page: Path) -> None
 
 def test_swaps_stand_before_spikes_and_gaps_are_summed_up(page: Path) -> None:
     wrong = page.read_text().split("What was wrong with the take</h2>")[1]
-    assert "M004 ↔ M021" in wrong
+    row = "<tr><td>M004 ↔ M021</td><td>530–549</td><td>0.83</td>"
+    assert row in wrong
+    assert wrong.split(row)[1].split("</tr>")[0].count("<td>") == 2  # distance, done
     assert wrong.index("M004 ↔ M021") < wrong.index("<th>Spikes</th>") < wrong.index("gaps of")
     gaps = wrong.split("<details>")[1]
     assert re.search(r"<summary>\d+ gaps, \d+ of them filled, by marker</summary>", gaps)

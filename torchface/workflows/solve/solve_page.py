@@ -43,7 +43,7 @@ def write_solve_page(folder: Path, title: str, report: SolveReport) -> Path:
         Section(
             "The performance",
             "The solved face with the markers as the solve used them, coloured by their distance from their sites.",
-            figures=[("frames.png", _strip(solution.rig, weights))],
+            figures=[("frames.png", _strip(solution.rig, weights, solution.take.numbers[shown].tolist()))],
             markup=_player(folder, solution),
         ),
         Section("What was done", done),
@@ -85,8 +85,8 @@ def _scale(errors: Tensor) -> float:
     return round_maximum(2 * float(known.median())) if len(known) else 1.0
 
 
-def _strip(rig: BlendshapeRig, weights: Tensor) -> Tensor:
-    """The frames that differ most from each other, in the order of time, (3,H,W)."""
+def _strip(rig: BlendshapeRig, weights: Tensor, numbers: Sequence[int]) -> Tensor:
+    """The frames that differ most from each other, with their numbers, in the order of time, (3,H,W)."""
     chosen = [int((weights.square().sum(1)).argmax())]
     while len(chosen) < min(_SHOWN_FRAMES, len(weights)):  # each choice depends on the one before
         chosen.append(int(torch.cdist(weights, weights[chosen]).amin(1).argmax()))
@@ -95,7 +95,7 @@ def _strip(rig: BlendshapeRig, weights: Tensor) -> Tensor:
 
     def image(frame: int) -> Tensor:
         moved = rig(weights[frame : frame + 1].to(rig.deltas))[0]
-        return caption(render(seen.with_vertices(moved), camera, lighting=lighting), f"frame {frame}", 12)
+        return caption(render(seen.with_vertices(moved), camera, lighting=lighting), f"frame {numbers[frame]}", 12)
 
     return sheet([image(frame) for frame in sorted(set(chosen))], _SHOWN_FRAMES)
 
@@ -134,7 +134,7 @@ def _defects(cleanup: Cleanup, fps: float) -> Section:
     tables = []
     for kind, title in _KINDS.items():
         defects = sorted((d for d in cleanup.defects if d.kind == kind), key=lambda d: -d.size)
-        rows = [(*row[:1], cleanup.span(defect), *row[1:]) for defect in defects for row in [_row(defect, fps)]]
+        rows = [_row(cleanup, defect, fps) for defect in defects]
         if rows:
             tables.append(Table((title, *_HEADING[1:]), rows[:_MAX_ROWS]))
         if len(rows) > _MAX_ROWS:
@@ -147,10 +147,10 @@ def _defects(cleanup: Cleanup, fps: float) -> Section:
     return Section("What was wrong with the take", cleanup.summary(), tables)
 
 
-def _row(defect: Defect, fps: float) -> tuple[str, ...]:
+def _row(cleanup: Cleanup, defect: Defect, fps: float) -> tuple[str, ...]:
     return (
         " ↔ ".join(defect.labels),
-        f"{defect.first}–{defect.last}",
+        cleanup.span(defect),
         f"{defect.first / fps:.2f}",
         f"{defect.size:.1f} mm",
         defect.action,
