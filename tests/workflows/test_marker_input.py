@@ -103,6 +103,18 @@ def test_a_trimmed_take_keeps_its_frames_numbers(ending: str, stage: Path, capsy
         assert "in a take of 50 frames, numbered 70 to 119" in " ".join(capsys.readouterr().err.split())
 
 
+def test_a_span_in_which_the_take_lacks_all_frames_is_refused(stage: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    whole = load_take(stage / "take.c3d")
+    save_take(whole.rows(torch.tensor([*range(40), *range(60, 150)])), stage / "dropped.csv")
+    some = solved(stage, "dropped.csv", "--frames", "38:62")
+    assert [text[6:11] for text in some.timecode] == ["00:38", "00:39", "01:00", "01:01"]
+    for more in ((), ("--neutral", "45")):
+        with pytest.raises(SystemExit):
+            solved(stage, "dropped.csv", "--frames", "42:50", *more)
+        said = " ".join(capsys.readouterr().err.split())
+        assert "found '42:50' in a take of 130 frames, numbered 0 to 149" in said
+
+
 def test_attach_takes_a_recorders_labels_too(stage: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sites = Attachment.load(stage / "attachment.json")
     where = ("--initial", stage / "attachment.json", "--quiet", "--out", stage / "sites.json", "--frames", "10:")

@@ -139,12 +139,13 @@ def frame_span(frames: str | None, take: Take) -> slice:
         raise ValueRangeError(f"--frames: found {frames!r}, expected A:B, such as 120:900, 120: or :900")
     low, high = take.numbers[[0, -1]].tolist()
     first, last = int(match[1] or low), min(int(match[2] or high + 1), high + 1)
-    if not low <= first < last:
+    rows = slice(*torch.searchsorted(take.numbers, torch.tensor([first, last])).tolist())
+    if first < low or rows.start >= rows.stop:  # a take may lack frames in between
         raise ValueRangeError(
-            f"--frames: found {frames!r} in a take of {len(take)} frames, numbered {low} to {high}, expected A < B and "
-            f"A from {low} to {high}"
+            f"--frames: found {frames!r} in a take of {len(take)} frames, numbered {low} to {high}, expected A < B, "
+            f"A from {low} to {high}, and frames from A to B"
         )
-    return slice(*torch.searchsorted(take.numbers, torch.tensor([first, last])).tolist())
+    return rows
 
 
 HEADER = ("take", "attachment")
