@@ -14,6 +14,7 @@ from torchface.geometry.similarity import Similarity
 from torchface.synthetic import performer
 from torchface.synthetic.stages import StageFlaws, perform, place_markers, record
 from torchface.workflows.solve.solution import Solution, SolveReport, SolveSettings, solve_markers
+from torchface.workflows.solve.take_check import check_head
 
 Capture = tuple[BlendshapeRig, Attachment, list[Tensor]]
 BENCH = pytest.mark.bench
@@ -237,6 +238,17 @@ def test_a_marker_that_is_elsewhere_in_the_whole_take_is_named(stage: Capture) -
     assert label == take.markers.names[4]
     assert float(distance) == pytest.approx(15.0, abs=4.0)
     assert SolveReport(warned, 1.0, 1.0).verdict().startswith("result: partly usable, 1 marker lies off the site")
+
+
+def test_neighbours_that_a_marker_far_off_draws_are_not_named() -> None:
+    rig = performer(texture=False)
+    sites = place_markers(rig, 40)
+    weights = rig.weights_from(perform(20, torch.Generator().manual_seed(4)).weights)
+    take = record(rig, sites, weights, torch.Generator().manual_seed(0), StageFlaws(noise=0.05)).take
+    values = take.markers.values.clone()
+    values[:, 5, 1] += 60
+    _, astray = check_head(rig, sites, replace(take, markers=Track(take.markers.names, values)))
+    assert [text.split()[0] for text in astray] == [take.markers.names[5]]
 
 
 def bent(rig: BlendshapeRig, size: float, seed: int) -> BlendshapeRig:

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass, replace
 
 import torch
+from torch import Tensor
 
 from torchface.attachment import Attachment
 from torchface.capture.markers import FitCheck, MarkerSolver, check_fit
@@ -16,7 +17,7 @@ from torchface.errors import AlignmentError, NameMismatchError
 from torchface.escaped_text import listed
 from torchface.geometry.meshes.operators import vertex_normals
 from torchface.rig import BlendshapeRig
-from torchface.take import Take
+from torchface.take import Take, Track
 from torchface.workflows.marker_input import MAX_SCALE_DIFFERENCE
 
 _COORDINATES = 3  # of a marker
@@ -132,10 +133,7 @@ def check_head(
     few = take.markers.frames(slice(None, None, max(1, len(take) // _LABEL_FRAMES)))
     if bool(torch.isnan(few.values).any(-1).all()):
         return warnings, []
-    given = attachment.residual
-    residual = rest_residual(rig, attachment, Take(take.fps, markers=few)).residual
-    assert residual is not None
-    residual = residual if given is None else residual - given
+    residual = _left_at_rest(rig, attachment, few)
     faces, rest = rig.neutral.faces, rig.vertices.detach()
     normals = attachment.on(faces, vertex_normals(rest, faces))
     pattern = residual_pattern(residual, attachment.on(faces, rest), normals)
@@ -144,9 +142,23 @@ def check_head(
             f"what is left at rest is smooth over the face ({pattern.smooth:.2g} mm, correlation of neighbours "
             f"{pattern.correlation:.2f}): the rig is most likely another head's; weights will be wrong"
         )
-    off = residual.norm(dim=-1)
-    astray = [m for m in off.argsort(descending=True).tolist() if not bool(inlier_markers(off)[m])]
-    return warnings, [f"{(attachment.labels or ())[m]} {float(off[m]):.1f} mm" for m in astray]
+    astray, labels, values = list[str](), attachment.labels or (), few.values.clone()
+    while len(astray) < len(labels) / 2:  # one that is far off draws its neighbours: without it, the next one
+        off = residual.norm(dim=-1)
+        worst = int(off.argmax())
+        if bool(inlier_markers(off)[worst]):
+            break
+        astray.append(f"{labels[worst]} {float(off[worst]):.1f} mm")
+        values[:, few.names.index(labels[worst])] = torch.nan
+        residual = _left_at_rest(rig, attachment, Track(few.names, values))
+    return warnings, astray
+
+
+def _left_at_rest(rig: BlendshapeRig, attachment: Attachment, markers: Track) -> Tensor:
+    """What is left at rest beyond the attachment's own residual, (M,3), millimetres; 0 where nothing is seen."""
+    residual = rest_residual(rig, attachment, Take(60.0, markers=markers)).residual
+    assert residual is not None
+    return residual if attachment.residual is None else residual - attachment.residual
 
 
 def neutral_warnings(rig: BlendshapeRig, attachment: Attachment, take: Take, frame: int, scale: bool) -> list[str]:
