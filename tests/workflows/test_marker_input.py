@@ -96,7 +96,7 @@ def test_a_trimmed_take_keeps_its_frames_numbers(ending: str, stage: Path, capsy
     assert some.timecode == whole.timecode[80:90]
     with pytest.raises(SystemExit):
         solved(stage, f"trimmed{ending}", "--frames", "80:90", "--neutral", "5")
-    assert "found frame 5, expected one of those that are solved, 80 to 89" in " ".join(capsys.readouterr().err.split())
+    assert "found frame 5, expected one of those that are used, 80 to 89" in " ".join(capsys.readouterr().err.split())
     for text in ("0:30", "120:"):
         with pytest.raises(SystemExit):
             solved(stage, f"trimmed{ending}", "--frames", text)

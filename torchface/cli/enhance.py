@@ -66,7 +66,8 @@ def enhance(
         attachment: Where the markers sit, on the rig or on the model's own mesh, as JSON; at least 12.
         pairs: Where vertices of the input's topology lie on the model: a .csv with columns input and model, vertex
             numbers from 0, or a .json of `torchface pick` (input as template, model as scan); at least 12.
-        neutral: A frame of the markers with the face at rest; motion counts from it. From the sites if absent.
+        neutral: A frame of the markers with the face at rest, counted from 0, also in a take that was trimmed; motion
+            counts from it. From the sites if absent.
         fps: Frames a second of meshes; 30 if absent.
         labels: What the take's labels are called in the attachment; see `torchface solve`.
         unit: What the coordinates of markers or meshes are in; if absent what the file says, else millimetres.

@@ -148,6 +148,17 @@ def frame_span(frames: str | None, take: Take) -> slice:
     return rows
 
 
+def row_of(frame: int, numbers: Tensor) -> int:
+    """Where the frame that --neutral names is among those that are used, by their numbers (T,)."""
+    row = int(torch.searchsorted(numbers, frame))
+    if row == len(numbers) or int(numbers[row]) != frame:
+        raise ValueRangeError(
+            f"--neutral: found frame {frame}, expected one of those that are used, {int(numbers[0])} to "
+            f"{int(numbers[-1])}"
+        )
+    return row
+
+
 HEADER = ("take", "attachment")
 _MAX_BYTES = 2**22
 

@@ -1,5 +1,6 @@
 """Markers as an animation of the model: in any place they move the face as the rig did; what does not fit is named."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -7,7 +8,7 @@ import torch
 
 from tests.workflows.enhance.conftest import FPS, FRAMES, Actor, coarse
 from torchface import Attachment, Take, Track, save_take
-from torchface.errors import AlignmentError, NameMismatchError, ShapeError, TopologyError
+from torchface.errors import AlignmentError, NameMismatchError, ShapeError, TopologyError, ValueRangeError
 from torchface.geometry.rotations import rotation_matrix
 from torchface.geometry.similarity import similarity_transform
 from torchface.synthetic.stages import place_markers
@@ -97,6 +98,23 @@ def test_a_marker_that_is_astray_in_one_frame_counts_as_not_seen_there(actor: Ac
     assert float((found.read(7, 8) - actor.frames[7]).norm(dim=-1).max()) < 5
     assert torch.equal(found.read(10, 11), found.read(9, 10))
     assert any("and held at the take's ends" in line for line in found.notes)
+
+
+def test_frames_of_a_trimmed_take_go_by_their_numbers(actor: Actor, tmp_path: Path) -> None:
+    points, labels = actor.attachment.on(actor.mesh.faces, actor.frames), actor.attachment.labels or ()
+    points[7, 3] += 500.0
+    points[9] = torch.nan
+    whole = Take(FPS, markers=Track(labels, points))
+    save_take(whole.frames(slice(3, None)), tmp_path / "cut.c3d")
+    save_take(replace(whole.frames(slice(3, None)), extras={}), tmp_path / "own.c3d")
+    given = {"attachment": actor.folder / "attachment.json", "rig": actor.folder / "rig.glb"}
+    cut, own = (coarse(actor, tmp_path / f"{name}.c3d", tmp_path, **given, neutral=number)
+                for name, number in (("cut", 5), ("own", 2)))  # fmt: skip
+    assert torch.equal(cut.read(0, 9), own.read(0, 9))
+    assert any(f"{labels[3]} in frame 7 by 86" in line for line in cut.notes)
+    assert any("(the first 9) show fewer" in line for line in cut.notes)
+    with pytest.raises(ValueRangeError, match="found frame 2, expected one of those that are used, 3 to 11"):
+        coarse(actor, tmp_path / "cut.c3d", tmp_path, **given, neutral=2)
 
 
 def test_frames_that_lack_markers_without_those_astray_are_interpolated_and_from_others_alone(

@@ -12,7 +12,7 @@ from torchface.capture import align_take
 from torchface.capture.markers.helmet_motion import steady_take
 from torchface.capture.markers.rest_pose import check_not_collinear, check_not_mirrored
 from torchface.enhancement.thin_shell import LEAST_POINTS, ThinShell, rigid_motion
-from torchface.errors import AlignmentError, ShapeError, TopologyError, ValueRangeError
+from torchface.errors import AlignmentError, ShapeError, TopologyError
 from torchface.geometry.meshes.surface_index import SurfaceIndex
 from torchface.geometry.similarity import Similarity, similarity_transform
 from torchface.mesh import Mesh, other_topology
@@ -21,7 +21,7 @@ from torchface.take import Take
 from torchface.temporal.interpolation import interpolated
 from torchface.workflows.enhance.coarse_animation import CoarseAnimation, check_scale, resampling_note
 from torchface.workflows.enhance.head_correspondence import PLACE, HeadCorrespondence, placed
-from torchface.workflows.marker_input import MarkerOptions, read_markers
+from torchface.workflows.marker_input import MarkerOptions, read_markers, row_of
 
 _SAME_SIZE = 0.05
 _MOST_AT_REST_MM = 15.0
@@ -87,8 +87,9 @@ def marker_animation(
     before and after.
     """
     take, notes = read_markers(path, sites.attachment.labels, options)
+    neutral = None if neutral is None else row_of(neutral, take.numbers)
     if take.seconds is not None:
-        if neutral is not None and 0 <= neutral < len(take):
+        if neutral is not None:
             neutral = int((take.resampled().times - take.times[neutral]).abs().argmin())
         uneven, take = take, take.resampled()
         notes = [*notes, resampling_note(path, uneven, take)]
@@ -104,7 +105,7 @@ def marker_animation(
     samples = placed(pose, take.markers.values)
     if attachment.residual is not None:
         samples = samples - attachment.residual.to(samples)
-    markers, gap_notes = _without_gaps(samples, path)
+    markers, gap_notes = _without_gaps(samples, take.numbers, path)
     rest = shell.rest
     away = _from_sites(rest, markers)
     offsets = float(away.square().sum(-1).nanmean(-1).sqrt().quantile(0.05))
@@ -120,10 +121,10 @@ def marker_animation(
     astray = off > _ASTRAY_MM
     if astray.any():
         frame, marker = divmod(int(off.argmax()), len(labels))
-        markers, gap_notes = _without_gaps(samples.masked_fill(astray[..., None], torch.nan), path)
+        markers, gap_notes = _without_gaps(samples.masked_fill(astray[..., None], torch.nan), take.numbers, path)
         gap_notes.append(
             f"warning: samples more than {_ASTRAY_MM:g} mm from their sites are left out: {int(astray.sum())}, at "
-            f"worst {labels[marker]} in frame {frame} by {float(off.max()):.0f} mm"
+            f"worst {labels[marker]} in frame {int(take.numbers[frame])} by {float(off.max()):.0f} mm"
         )
     if neutral is not None:
         seen = markers[neutral]
@@ -152,8 +153,6 @@ def marker_animation(
 def _pose(path: Path, take: Take, sites: MarkerSites, shell: ThinShell, neutral: int | None) -> Similarity:
     """From the take's space to the model's."""
     assert take.markers is not None
-    if neutral is not None and not 0 <= neutral < len(take):
-        raise ValueRangeError(f"--neutral: found frame {neutral}, expected 0 to {len(take) - 1}")
     # The mean places of a head that moves freely are those of a smaller face.
     take, _ = steady_take(take)
     assert take.markers is not None
@@ -173,8 +172,9 @@ def _pose(path: Path, take: Take, sites: MarkerSites, shell: ThinShell, neutral:
     return pose
 
 
-def _without_gaps(markers: Tensor, path: Path) -> tuple[Tensor, list[str]]:
-    """Frames with too few markers get those of the frames before and after, linear in between."""
+def _without_gaps(markers: Tensor, numbers: Tensor, path: Path) -> tuple[Tensor, list[str]]:
+    """Frames (T,M,3) with too few markers get those of the frames before and after, linear in between; their numbers
+    (T,) are for the notes."""
     enough = torch.isfinite(markers).all(-1).sum(1) >= LEAST_POINTS
     rows = enough.nonzero()[:, 0]
     if len(rows) == 0:
@@ -187,7 +187,7 @@ def _without_gaps(markers: Tensor, path: Path) -> tuple[Tensor, list[str]]:
     if still.any():  # the frames beside show other markers
         nearest = torch.searchsorted(rows, still.nonzero()[:, 0]).clamp(max=len(rows) - 1)
         filled[still] = markers[rows[nearest]]
-    first = int((~enough).nonzero()[0, 0])
+    first = int(numbers[~enough][0])
     return filled, [
         f"warning: {int((~enough).sum())} of {len(markers)} frames (the first {first}) show fewer than {LEAST_POINTS} "
         "markers; they are interpolated from the frames before and after"

@@ -5,14 +5,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-from torch import Tensor
 
 from torchface.attachment import Attachment
-from torchface.errors import ValueRangeError
 from torchface.io import load_rig
 from torchface.io.protocols.weight_sender import find_receiver
 from torchface.progress import Progress, silent
-from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions, frame_span, read_markers
+from torchface.workflows.marker_input import DEFAULT_OPTIONS, MarkerOptions, frame_span, read_markers, row_of
 from torchface.workflows.solve.head_camera import HeadCamera, predicted_curves
 from torchface.workflows.solve.solution import SolveReport, SolveSettings, solve_markers
 from torchface.workflows.solve.weight_stream import stream_take
@@ -59,7 +57,7 @@ def solve_take(
     take, notes = read_markers(inputs.take, attachment.labels or (), inputs.options)
     span = frame_span(inputs.options.frames, take)
     if settings.neutral is not None:
-        settings = replace(settings, neutral=_row(settings.neutral, take.numbers[span]))
+        settings = replace(settings, neutral=row_of(settings.neutral, take.numbers[span]))
     settings = replace(settings, free_scale=inputs.options.frees_scale(inputs.take))
     camera, predicted = inputs.camera, None
     if camera is not None:
@@ -85,14 +83,3 @@ def solve_take(
         sent = stream_take(with_eyes(solution.take, rig), outputs.stream)
         report = replace(report, notes=(*report.notes, sent))
     return report
-
-
-def _row(frame: int, numbers: Tensor) -> int:
-    """Where a frame is among those that are solved, by their numbers (T,)."""
-    row = int(torch.searchsorted(numbers, frame))
-    if row == len(numbers) or int(numbers[row]) != frame:
-        raise ValueRangeError(
-            f"--neutral: found frame {frame}, expected one of those that are solved, {int(numbers[0])} to "
-            f"{int(numbers[-1])}"
-        )
-    return row
