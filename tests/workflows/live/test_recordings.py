@@ -127,6 +127,8 @@ def test_two_sessions_of_one_folder_record_into_folders_of_their_own(dome: Path,
 def test_a_take_is_kept_from_rows_read_again_and_imported_from_files(dome: Path, tmp_path: Path) -> None:
     told: list[str] = []
     session, recordings = a_session(Endless(1), tmp_path / "takes", dome, told)
+    import_recordings(tmp_path / "new", recordings, told.append)  # the first take makes the folder
+    assert not told
     generator = torch.Generator().manual_seed(0)
     head = head_rotations(0.3 * torch.randn(6, 3, generator=generator))
     parts = (torch.arange(6)[:, None] / 24, torch.rand(6, 52, generator=generator), head.flatten(1))

@@ -273,7 +273,7 @@ def _keep_dropped(preparing: Preparing, recordings: Recordings, say: Say) -> Non
 def import_recordings(folder: Path, recordings: Recordings, say: Say) -> None:
     """Makes takes of the recordings that lie in a folder as files, such as a phone's, once each."""
     known = {take.name for take in kept_takes(folder)}
-    for path in visible_files(folder, (".csv", *RECORDING_ENDINGS)):
+    for path in visible_files(folder, (".csv", *RECORDING_ENDINGS)) if folder.is_dir() else []:
         if printable(path.name) not in (WEIGHTS, LIVE_LINK, SUMMARY, *known):
             try:
                 recordings.keep(path.name, take_rows(load_take(path)).float())
