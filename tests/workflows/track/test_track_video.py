@@ -245,6 +245,8 @@ def test_a_cut_to_another_face_is_said_and_not_solved(filmed: Filmed, tmp_path: 
     assert [(span.first, span.last) for span in tracked.others] == [(FRAMES, 2 * FRAMES - 1)]
     assert f"frames {FRAMES} to {2 * FRAMES - 1} show another face" in "\n".join(tracked.lines())
     assert (FRAMES, 2 * FRAMES - 1, "another face") in tracked.suspect_spans()
+    found = f"the face was found in {FRAMES} of {2 * FRAMES} frames (50.0 %), another face in {FRAMES}"
+    assert tracked.verdict().startswith(f"result: partly usable, {found}")
     confidence = load_take(tmp_path / "out" / "confidence.csv").weights
     assert confidence.values[:FRAMES].mean() > 0.5
     assert (confidence.values[FRAMES:] == 0).all()
