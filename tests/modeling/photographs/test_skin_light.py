@@ -136,6 +136,24 @@ def test_long_hair_beside_the_jaw_is_no_beard_and_a_beard_stays(head: Mesh, came
     assert float(all_shown[2].own[grown].median()) > 0.9
 
 
+def test_folds_that_look_like_hair_are_skin(head: Mesh, camera: Camera) -> None:
+    """Deep folds beside the nose are dark, and the network takes some of them for hair."""
+    places = FacePlaces.of(head)
+    at = places.place[:, :2] * places.place.new_tensor([1.0, 0.5])
+    fold = ((at - at.new_tensor([0.3, -0.3])).norm(dim=1) < 0.1) & places.cheeks & ~part_vertices(head)
+    picture = render(
+        replace(head, colors=torch.where(fold[:, None], HAIR, head.colors)), camera, lighting=EVEN, samples=1
+    )
+    parts = planted_parts(picture, {"hair": HAIR, "background": torch.zeros(3)}, 0.05)
+    graph = VertexGraph(head.faces, len(head.vertices), head.vertices)
+    seen = ShownParts.of(parts, camera.project(head.vertices.double()), places, graph)
+    inner = fold & (graph.least((fold | ~places.cheeks).double()) > 0)
+    assert float(seen.own[inner].min()) > 0.9
+    assert float(seen.doubt[inner].max()) < 0.1
+    found = photographed_skin([head], None, [picture], [camera], FitSettings(texture_size=128, parts=[parts])).colors
+    assert float((found[inner] - HAIR).norm(dim=1).median()) < 0.25
+
+
 @pytest.mark.parametrize("yaw", [30.0, 60.0])
 def test_long_hair_before_what_a_turned_head_hides_of_mouth_and_neck_is_no_beard(head: Mesh, yaw: float) -> None:
     places = FacePlaces.of(head)

@@ -34,6 +34,14 @@ class VertexGraph:
         """How many rounds reach as far as these on the performer's mesh."""
         return max(1, round(iterations * self.finer))
 
+    def reached(self, starts: Tensor, through: Tensor, edges: int) -> Tensor:
+        """The starts (V,) bool, and what lies up to so many of the performer's edges from them along vertices that are
+        let through, (V,) bool."""
+        found = starts
+        for _ in range(max(1, round(edges * self.finer**0.5))):
+            found = starts | (through & (self.sum(found.double()[:, None], itself=True)[:, 0] > 0))
+        return found
+
     def sum(self, values: Tensor, itself: bool = False) -> Tensor:
         """Of the values (V,) or (V,C) of each vertex's neighbours, and of the vertex itself if asked for."""
         total = torch.from_numpy(self._beside @ values.numpy()).to(values)

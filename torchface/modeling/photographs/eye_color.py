@@ -69,7 +69,7 @@ def white_brightness(
 ) -> float:
     """How bright the whites of eyes are beside their material's, in [0.6,1]; 1 where no photograph shows them.
 
-    Lids shade them, and those of the material would shine out of a face. Arguments as of :func:`iris_color`.
+    Lids shade them, and the material's own would be too bright. Arguments as of :func:`iris_color`.
     """
     found = list[Tensor]()
     for image, eyes, centres, radius in _eyes(posed, images, cameras, irises):

@@ -195,10 +195,8 @@ def _lit_evenly(
     graph: VertexGraph,
     others: Tensor,
 ) -> _View:
-    shown, known = (
-        surface.shown_in(image, camera),
-        ShownParts.of(parts, camera.project(surface.vertices), places, graph),
-    )
+    shown = surface.shown_in(image, camera)
+    known = ShownParts.of(parts, camera.project(surface.vertices), places, graph)
     light = skin_light(shown, surface.normals, camera, places.cheeks & ~others & (known.bare > _BARE))
     shown = replace(shown, colors=unlit(shown.colors, surface.normals, camera, light))
     return _View(image, camera, surface, places, known, shown, light, torch.zeros_like(surface.vertices))

@@ -20,6 +20,7 @@ _BROW, _FRINGE = 0.13, (0.16, 0.30)
 """In distances between the eyes' outer corners, but for the second row: shares of the way to the face's outline."""
 
 _HANGS = 0.1, 0.5  # shares of hair over the brows, and about the mouth, between which a fringe and a beard begin
+_STRAND, _HANGING, _SHADED = 0.2, 40, 6  # share of hair; edges that it hangs down, that it shades
 _CHIN, _FULLEST = 0.2, 0.95  # of the same distances, beside the middle and behind the chin; quantile
 
 _FRAMES = (0.05, 0.08, 0.36, 0.44)  # from the eyes' landmarks
@@ -116,8 +117,14 @@ class ShownParts:
         beard = ramp(mouth.quantile(_FULLEST), *_HANGS)
         grown = hair * ramp(_NOSE - up, 0.0, 0.1) * (places.out < 1) * beard
         grown = torch.maximum(grown, hair * places.brow * (1 - fringe))
+        # What looks like hair below the brows and does not hang from the head is a fold, stubble, a moustache.
+        low = (up < places.brows) & (places.out < 1)
+        strand = hair > _STRAND
+        hangs = graph.reached(strand & ~low, strand, _HANGING)
+        grown = torch.maximum(grown, hair * (low & ~hangs))
         # What lies beside hair is in its shadow, and between strands of a fringe is no skin to be painted.
         over = torch.where(up > _NOSE, 1.0, 1 - beard)
+        over = over * (~low | graph.reached(hangs, low, _SHADED))
         strands = parts.of("hair")[None]
         wide = replace(parts, shares=max_pool2d(strands, _SHADOW, 1, _SHADOW // 2).expand_as(parts.shares))
         shaded = wide.at(pixels, "hair").double().nan_to_num(0.0) * over * (1 - (1 - fringe) * places.brow)
